@@ -1,0 +1,61 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from mjx_refine.errors import InputError
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_atomic(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -> Path:
+    """Writes a file through ``write(stream)``; the file at ``path`` is the old one or the whole new one, never a part.
+
+    Raises:
+      InputError: the place cannot be written.
+    """
+    path = Path(path)
+    with _replacing(path) as temporary, open(temporary, "wb") as stream:
+        write(stream)
+        stream.flush()
+        os.fsync(stream.fileno())
+    return path
+
+
+def write_text(path: str | os.PathLike, text: str) -> Path:
+    """Writes ``text`` as UTF-8, whole or not at all."""
+    return write_atomic(path, lambda stream: stream.write(text.encode()))
+
+
+def writable_directory(path: str | os.PathLike) -> Path:
+    """Checks, without making it, that ``path`` is or can become a directory to write in.
+
+    Raises:
+      InputError: it cannot.
+    """
+    path = Path(path)
+    existing = path
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir():
+        raise InputError(f"{path}: {existing} is a file; expected a directory to write in; name another --out")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: no permission to write in {existing}; name another --out")
+    return path
