@@ -1,0 +1,220 @@
+"""What was seen: optical flow, instance masks and their rate, from and to ``flows.npz``."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from mjx_refine import files
+from mjx_refine.errors import InputError
+
+_KEYS = ("flow", "masks", "fps", "frames", "flow_sigma")
+MAX_ELEMENTS = 2 * 10**9
+
+
+@dataclasses.dataclass(frozen=True)
+class Observation:
+    """An observed clip.
+
+    Attributes:
+      flow: optical flow from frame t to t + 1 [px/frame], x right, y down; NaN where it was not measured.
+      masks: instance ids, 0 is the background; None where the clip has none.
+      fps: frames a second.
+      frames: RGB pictures, only for display.
+      flow_sigma: standard deviation of the flow's noise [px], one number or one a pixel.
+      source: where it came from, for messages.
+    """
+
+    flow: Float[np.ndarray, "intervals height width 2"]
+    masks: Int[np.ndarray, "frames height width"] | None
+    fps: float
+    frames: UInt8[np.ndarray, "frames height width 3"] | None = None
+    flow_sigma: float | Float[np.ndarray, "intervals height width"] | None = None
+    source: str = "<observation>"
+
+    @property
+    def length(self) -> int:
+        """The number of frames T; the flow has T - 1 intervals."""
+        return self.flow.shape[0] + 1
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) [px]."""
+        return self.flow.shape[2], self.flow.shape[1]
+
+    def mask_ids(self) -> list[int]:
+        """The instance ids that occur, ascending."""
+        return [] if self.masks is None else [int(i) for i in np.unique(self.masks) if i != 0]
+
+
+def load_observation(path: str | os.PathLike) -> Observation:
+    """Reads ``flows.npz``.
+
+    Raises:
+      InputError: the file is missing, no npz, holds pickles, or its arrays do not fit together.
+    """
+    path = Path(path)
+    _check_sizes(path)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError, MemoryError) as error:
+        reason = (
+            "it holds pickled objects"
+            if "allow_pickle" in str(error) or "Object arrays" in str(error)
+            else error
+        )
+        raise InputError(
+            f"{path}: cannot be read as npz ({reason}); expected numpy.savez of plain arrays"
+        ) from error
+    for key in arrays:
+        if key not in _KEYS:
+            raise InputError(f"{path}: unknown key {key!r}; expected {', '.join(_KEYS)}; remove or rename it")
+    for key in ("flow", "fps"):
+        if key not in arrays:
+            raise InputError(
+                f"{path}: the key {key!r} is missing; found {', '.join(arrays) or 'nothing'}; add it"
+            )
+    return make_observation(source=str(path), **arrays)
+
+
+def _check_sizes(path: Path) -> None:
+    """Refuses headers that promise more than memory holds, before anything is read."""
+    try:
+        if not path.is_file():
+            raise InputError(f"{path}: no such file; expected an observation (npz with flow, masks, fps)")
+        with zipfile.ZipFile(path) as archive:
+            for info in archive.infolist():
+                with archive.open(info) as stream:
+                    version = np.lib.format.read_magic(stream)
+                    read = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}[
+                        version[0]
+                    ]
+                    shape, _, dtype = read(stream)
+                count = int(np.prod([int(n) for n in shape], dtype=object)) if shape else 1
+                if count > MAX_ELEMENTS or count * dtype.itemsize > info.file_size:
+                    raise InputError(
+                        f"{path}: {info.filename} declares {count} numbers, the file holds {info.file_size} bytes "
+                        f"(at most {MAX_ELEMENTS} numbers are read); the file is damaged or too large; write it again"
+                    )
+    except (zipfile.BadZipFile, OSError, EOFError) as error:
+        raise InputError(f"{path}: not a readable npz file ({error}); write it with numpy.savez") from error
+    except (ValueError, KeyError, NotImplementedError, RuntimeError, TypeError, SyntaxError) as error:
+        raise InputError(
+            f"{path}: not an npz of plain arrays ({error}); write it with numpy.savez"
+        ) from error
+
+
+def make_observation(
+    flow: np.ndarray,
+    fps: float | np.ndarray,
+    masks: np.ndarray | None = None,
+    frames: np.ndarray | None = None,
+    flow_sigma: float | np.ndarray | None = None,
+    source: str = "<observation>",
+) -> Observation:
+    """Checks arrays against one another and makes an observation of them.
+
+    Raises:
+      InputError: a shape, type or value is wrong; the message names the array.
+    """
+    flow = np.asarray(flow)
+    if flow.dtype.kind != "f":
+        raise InputError(f"{source}: flow has dtype {flow.dtype}; expected float16, float32 or float64")
+    if flow.ndim != 4 or flow.shape[3] != 2:
+        raise InputError(f"{source}: flow has shape {flow.shape}; expected (T-1, H, W, 2)")
+    if min(flow.shape) < 1:
+        raise InputError(
+            f"{source}: flow has shape {flow.shape}; expected at least two frames (one interval) of pixels"
+        )
+    intervals, height, width = flow.shape[:3]
+    if min(height, width) < 8:
+        raise InputError(f"{source}: frames of {width}x{height}; expected at least 8x8 pixels")
+    if np.isinf(flow).any():
+        raise InputError(
+            f"{source}: flow holds infinities; expected finite numbers, or NaN where it was not measured"
+        )
+    if masks is None and not np.isfinite(flow).any():
+        raise InputError(f"{source}: flow is NaN everywhere and there are no masks; nothing was measured")
+    return Observation(
+        flow=flow.astype(np.float32),
+        masks=None if masks is None else _masks(np.asarray(masks), (intervals + 1, height, width), source),
+        fps=_fps(fps, source),
+        frames=None
+        if frames is None
+        else _frames(np.asarray(frames), (intervals + 1, height, width, 3), source),
+        flow_sigma=None if flow_sigma is None else _sigma(np.asarray(flow_sigma), flow.shape[:3], source),
+        source=source,
+    )
+
+
+def _fps(fps: float | np.ndarray, source: str) -> float:
+    array = np.asarray(fps)
+    if array.size != 1 or array.dtype.kind not in "fiu":
+        raise InputError(
+            f"{source}: fps has shape {array.shape} and dtype {array.dtype}; expected one number"
+        )
+    value = float(array.reshape(()))
+    if not 0.1 <= value <= 1e5:
+        raise InputError(
+            f"{source}: fps = {value:g}; expected 0.1 <= fps <= 100000 frames a second; correct it"
+        )
+    return value
+
+
+def _masks(masks: np.ndarray, shape: tuple[int, ...], source: str) -> np.ndarray:
+    if masks.dtype.kind not in "iub":
+        raise InputError(f"{source}: masks have dtype {masks.dtype}; expected integer ids (0 = background)")
+    if masks.shape != shape:
+        raise InputError(
+            f"{source}: masks have shape {masks.shape}; expected {shape} (one frame more than the flow)"
+        )
+    if masks.dtype.kind != "b" and (masks.min() < 0 or masks.max() > 2**30):
+        raise InputError(
+            f"{source}: mask ids lie in [{masks.min()}, {masks.max()}]; expected 0 <= id <= 2^30"
+        )
+    if not masks.any():
+        raise InputError(
+            f"{source}: masks are empty in every frame; expected at least one object; see `refine observe`"
+        )
+    if len(np.unique(masks)) > 65:
+        raise InputError(f"{source}: masks hold {len(np.unique(masks)) - 1} ids; expected at most 64 objects")
+    return masks.astype(np.int32)
+
+
+def _frames(frames: np.ndarray, shape: tuple[int, ...], source: str) -> np.ndarray:
+    if frames.dtype != np.uint8 or frames.shape != shape:
+        raise InputError(f"{source}: frames are {frames.dtype} {frames.shape}; expected uint8 {shape}")
+    return frames
+
+
+def _sigma(sigma: np.ndarray, shape: tuple[int, ...], source: str) -> float | np.ndarray:
+    if sigma.dtype.kind not in "fiu" or sigma.shape not in ((), shape):
+        raise InputError(
+            f"{source}: flow_sigma is {sigma.dtype} {sigma.shape}; expected one number or shape {shape}"
+        )
+    if not (sigma[np.isfinite(sigma)] >= 0).all() or not np.isfinite(sigma).any():
+        raise InputError(f"{source}: flow_sigma holds negative or no finite numbers; expected pixels >= 0")
+    return float(sigma) if sigma.ndim == 0 else sigma.astype(np.float32)
+
+
+def save_observation(path: str | os.PathLike, observation: Observation) -> Path:
+    """Writes ``flows.npz`` (flow as float16 where that loses less than 0.02 px), whole or not at all."""
+    flow = observation.flow
+    small = np.nanmax(np.abs(flow), initial=0.0) < 40.0
+    arrays: dict[str, np.ndarray] = {
+        "flow": flow.astype(np.float16 if small else np.float32),
+        "fps": np.float64(observation.fps),
+    }
+    if observation.masks is not None:
+        arrays["masks"] = observation.masks.astype(np.uint8 if observation.masks.max() < 256 else np.int32)
+    if observation.frames is not None:
+        arrays["frames"] = observation.frames
+    if observation.flow_sigma is not None:
+        arrays["flow_sigma"] = np.asarray(observation.flow_sigma, np.float32)
+    return files.write_atomic(path, lambda stream: np.savez_compressed(stream, **arrays))  # type: ignore[arg-type]

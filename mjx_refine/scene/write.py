@@ -1,0 +1,82 @@
+"""Scenes back to YAML; load -> write -> load gives the same scene."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import yaml
+
+from mjx_refine import files
+from mjx_refine.scene.model import Body, Scene
+
+
+def scene_entries(scene: Scene) -> list[dict]:
+    """The list of entries that the YAML holds, of plain dicts, lists and numbers."""
+    entries = [_body_entry(body) for body in scene.objects]
+    camera = scene.camera
+    entries.append(
+        {
+            "type": "camera",
+            "fovy": camera.fovy,
+            "orientation": camera.orientation,
+            "position": list(camera.position),
+        }
+    )
+    entries.append({"type": "gravity", "gravity": list(scene.gravity)})
+    for effect in scene.effects:
+        entry: dict = {"type": "effect", "effect": effect.effect}
+        if effect.target is not None:
+            entry["target"] = effect.target
+        entry["parameters"] = {k: list(v) if isinstance(v, tuple) else v for k, v in effect.parameters}
+        entries.append(entry)
+    return entries
+
+
+def _body_entry(body: Body) -> dict:
+    entry: dict = {"type": body.shape, "name": body.name}
+    if body.shape == "box":
+        entry["size"] = list(body.size)
+    else:
+        entry["radius"] = body.size[0]
+        if body.shape == "cylinder":
+            entry["height"] = body.size[1]
+    entry["state"] = {
+        "position": list(body.position),
+        "orientation": list(body.orientation),
+        "linear_velocity": list(body.linear_velocity),
+        "angular_velocity": list(body.angular_velocity),
+    }
+    entry["physics"] = {
+        "friction": list(body.friction),
+        "mass": body.mass,
+        "damping": body.damping,
+        "stiffness": body.stiffness,
+    }
+    return entry
+
+
+class _Dumper(yaml.SafeDumper):
+    """Lists of numbers in one line, mappings one key a line."""
+
+    def represent_list_inline(self, data: list) -> yaml.Node:
+        scalars = all(isinstance(v, int | float) for v in data)
+        return self.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=scalars)
+
+
+_Dumper.add_representer(list, _Dumper.represent_list_inline)
+
+
+def dump_scene(scene: Scene) -> str:
+    """The scene as YAML text; numbers keep every digit."""
+    return yaml.dump(scene_entries(scene), Dumper=_Dumper, sort_keys=False, width=200, allow_unicode=True)
+
+
+def save_scene(path: str | os.PathLike, scene: Scene) -> Path:
+    """Writes the scene as YAML, whole or not at all."""
+    return files.write_text(path, dump_scene(scene))
+
+
+def save_scenes(path: str | os.PathLike, scenes: list[Scene]) -> Path:
+    """Writes several samples as YAML documents separated by ``---``."""
+    return files.write_text(path, "---\n".join(dump_scene(scene) for scene in scenes))
