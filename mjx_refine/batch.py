@@ -1,0 +1,139 @@
+"""Scenes as arrays: a batch of candidates of one scene kind, the currency between space, simulation and views."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.scene import Body, Camera, Scene, Shape
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneBatch:
+    """B candidates of one scene kind with N objects, float64.
+
+    Attributes:
+      shapes: the N primitives, the same for every candidate.
+      size: MuJoCo's ``geom_size``: sphere (r, 0, 0), box half extents, cylinder (r, HALF height, 0) [m].
+      mass: [kg].
+      friction: (sliding [1], rolling [m]).
+      damping: contact damping, <= 0 [1/s].
+      stiffness: > 0 [1/s^2].
+      position: centres at the first frame, world frame [m].
+      quaternion: unit, w x y z, body to world.
+      linear_velocity: world frame [m/s].
+      angular_velocity: body frame [rad/s].
+      gravity: [m/s^2].
+      camera_position: [m].
+      camera_pitch: rotation about the world's x axis, 0 looks straight down [rad].
+      camera_fovy: vertical field of view [rad].
+    """
+
+    shapes: tuple[Shape, ...]
+    size: Float[np.ndarray, "batch objects 3"]
+    mass: Float[np.ndarray, "batch objects"]
+    friction: Float[np.ndarray, "batch objects 2"]
+    damping: Float[np.ndarray, "batch objects"]
+    stiffness: Float[np.ndarray, "batch objects"]
+    position: Float[np.ndarray, "batch objects 3"]
+    quaternion: Float[np.ndarray, "batch objects 4"]
+    linear_velocity: Float[np.ndarray, "batch objects 3"]
+    angular_velocity: Float[np.ndarray, "batch objects 3"]
+    gravity: Float[np.ndarray, "batch 3"]
+    camera_position: Float[np.ndarray, "batch 3"]
+    camera_pitch: Float[np.ndarray, "batch"]
+    camera_fovy: Float[np.ndarray, "batch"]
+
+    def __len__(self) -> int:
+        return len(self.mass)
+
+    def __getitem__(self, rows: slice | np.ndarray) -> SceneBatch:
+        """The candidates in ``rows``, as a batch."""
+        return self.map(lambda array: array[rows])
+
+    def map(self, function) -> SceneBatch:
+        """Applies ``function`` to every array."""
+        changed = {f.name: function(getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "shapes"}
+        return dataclasses.replace(self, **changed)
+
+
+def concatenate(batches: list[SceneBatch]) -> SceneBatch:
+    """One batch of all candidates; the shapes must be equal.
+
+    Raises:
+      ValueError: no batch, or the scene kinds differ.
+    """
+    if not batches or any(batch.shapes != batches[0].shapes for batch in batches):
+        raise ValueError(f"scene kinds {[b.shapes for b in batches]}; expected at least one, all with the same shapes")
+    names = [f.name for f in dataclasses.fields(SceneBatch) if f.name != "shapes"]
+    arrays = {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in names}
+    return SceneBatch(batches[0].shapes, **arrays)
+
+
+def geom_size(body: Body) -> tuple[float, float, float]:
+    """MuJoCo's ``geom_size`` of a body [m]."""
+    if body.shape == "sphere":
+        return (body.size[0], 0.0, 0.0)
+    if body.shape == "cylinder":
+        return (body.size[0], body.size[1] / 2, 0.0)
+    return (body.size[0], body.size[1], body.size[2])
+
+
+def batch_from_scenes(scenes: list[Scene]) -> SceneBatch:
+    """Scenes of one kind as a batch."""
+
+    def rows(value) -> np.ndarray:
+        return np.array([[value(body) for body in scene.objects] for scene in scenes], np.float64)
+
+    return concatenate(
+        [
+            SceneBatch(
+                shapes=scenes[0].shapes if len({s.shapes for s in scenes}) == 1 else (),
+                size=rows(geom_size),
+                mass=rows(lambda b: b.mass),
+                friction=rows(lambda b: b.friction),
+                damping=rows(lambda b: b.damping),
+                stiffness=rows(lambda b: b.stiffness),
+                position=rows(lambda b: b.position),
+                quaternion=rows(lambda b: b.orientation),
+                linear_velocity=rows(lambda b: b.linear_velocity),
+                angular_velocity=rows(lambda b: b.angular_velocity),
+                gravity=np.array([s.gravity for s in scenes], np.float64),
+                camera_position=np.array([s.camera.position for s in scenes], np.float64),
+                camera_pitch=np.deg2rad([s.camera.orientation for s in scenes]),
+                camera_fovy=np.deg2rad([s.camera.fovy for s in scenes]),
+            )
+        ]
+    )
+
+
+def scene_from_batch(batch: SceneBatch, row: int, like: Scene) -> Scene:
+    """Candidate ``row`` as a scene with the names and effects of ``like``."""
+    bodies = []
+    for i, body in enumerate(like.objects):
+        x, y, z = batch.size[row, i].tolist()
+        size = {"sphere": (x,), "cylinder": (x, 2 * y), "box": (x, y, z)}[body.shape]
+        bodies.append(
+            dataclasses.replace(
+                body,
+                size=size,
+                position=tuple(batch.position[row, i].tolist()),
+                orientation=tuple(batch.quaternion[row, i].tolist()),
+                linear_velocity=tuple(batch.linear_velocity[row, i].tolist()),
+                angular_velocity=tuple(batch.angular_velocity[row, i].tolist()),
+                friction=tuple(batch.friction[row, i].tolist()),
+                mass=float(batch.mass[row, i]),
+                damping=float(batch.damping[row, i]),
+                stiffness=float(batch.stiffness[row, i]),
+            )
+        )
+    camera = Camera(
+        position=tuple(batch.camera_position[row].tolist()),
+        orientation=float(np.rad2deg(batch.camera_pitch[row])),
+        fovy=float(np.rad2deg(batch.camera_fovy[row])),
+    )
+    return dataclasses.replace(
+        like, objects=tuple(bodies), camera=camera, gravity=tuple(batch.gravity[row].tolist())
+    )

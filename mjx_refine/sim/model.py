@@ -1,0 +1,160 @@
+"""The MuJoCo model of a scene kind, and which of its fields a candidate changes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.scene import Shape
+
+SUBSTEPS = 8
+"""Physics steps a frame, at every frame rate."""
+
+FRICTION_DAMPING = -30.0
+"""Second number of ``solreffriction`` [1/s]: softer makes friction syrup, harder makes sliding bodies hop."""
+
+TORSION = 0.005
+"""Torsional friction of every contact [m]."""
+
+_GEOM = {
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelFields:
+    """The fields of ``mjModel`` that depend on a candidate, for B candidates, N objects and P contact pairs.
+
+    Geoms and bodies are the N objects' alone (index 0 of the model, the floor and the world, stays as it is).
+    """
+
+    geom_size: Float[np.ndarray, "batch objects 3"]
+    geom_rbound: Float[np.ndarray, "batch objects"]
+    body_mass: Float[np.ndarray, "batch objects"]
+    body_inertia: Float[np.ndarray, "batch objects 3"]
+    body_invweight0: Float[np.ndarray, "batch objects 2"]
+    pair_friction: Float[np.ndarray, "batch pairs 5"]
+    pair_solref: Float[np.ndarray, "batch pairs 2"]
+    pair_solreffriction: Float[np.ndarray, "batch pairs 2"]
+    gravity: Float[np.ndarray, "batch 3"]
+
+
+def contact_pairs(count: int) -> list[tuple[int, int]]:
+    """(first, second) objects of every contact pair; -1 is the floor. Floor pairs come first."""
+    floor = [(-1, i) for i in range(count)]
+    return floor + [(i, j) for i in range(count) for j in range(i + 1, count)]
+
+
+def build_spec(shapes: tuple[Shape, ...], fps: float, names: tuple[str, ...] | None = None) -> mujoco.MjSpec:
+    """A spec with the floor, one free body of unit mass for each shape, and explicit contact pairs."""
+    names = names or tuple(f"object_{i}" for i in range(len(shapes)))
+    spec = mujoco.MjSpec()
+    spec.option.timestep = 1.0 / (fps * SUBSTEPS)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    free = {"contype": 0, "conaffinity": 0}
+    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], **free)
+    for name, shape in zip(names, shapes, strict=True):
+        body = spec.worldbody.add_body(name=name, explicitinertial=True, mass=1.0, inertia=[1.0, 1.0, 1.0])
+        body.add_freejoint(name=name)
+        body.add_geom(name=name, type=_GEOM[shape], size=[0.1, 0.1, 0.1], **free)
+    for first, second in contact_pairs(len(shapes)):
+        geoms = ["floor" if i < 0 else names[i] for i in (first, second)]
+        spec.add_pair(geomname1=geoms[0], geomname2=geoms[1], condim=6)
+    return spec
+
+
+def model_fields(batch: SceneBatch) -> ModelFields:
+    """The model's fields for every candidate, in closed form (a free body's ``invweight0`` is (1/m, mean 1/I))."""
+    inertia = uniform_inertia(batch)
+    radius, half = batch.size[..., 0], batch.size[..., 1]
+    rbound = np.stack(
+        [
+            {
+                "sphere": radius[:, i],
+                "cylinder": np.hypot(radius[:, i], half[:, i]),
+                "box": np.linalg.norm(batch.size[:, i], axis=-1),
+            }[shape]
+            for i, shape in enumerate(batch.shapes)
+        ],
+        axis=1,
+    )
+    pairs = contact_pairs(len(batch.shapes))
+    first = np.array([second if first < 0 else first for first, second in pairs])
+    second = np.array([second for _, second in pairs])
+    sliding, rolling = np.moveaxis(np.maximum(batch.friction[:, first], batch.friction[:, second]), -1, 0)
+    stiffness = np.maximum(batch.stiffness[:, first], batch.stiffness[:, second])
+    damping = np.minimum(batch.damping[:, first], batch.damping[:, second])
+    torsion = np.full_like(sliding, TORSION)
+    return ModelFields(
+        geom_size=batch.size,
+        geom_rbound=rbound,
+        body_mass=batch.mass,
+        body_inertia=inertia,
+        body_invweight0=np.stack([1 / batch.mass, (1 / inertia).mean(-1)], -1),
+        pair_friction=np.stack([sliding, sliding, torsion, rolling, rolling], -1),
+        pair_solref=np.stack([-stiffness, damping], -1),
+        pair_solreffriction=np.stack([-stiffness, np.full_like(stiffness, FRICTION_DAMPING)], -1),
+        gravity=batch.gravity,
+    )
+
+
+def uniform_inertia(batch: SceneBatch) -> Float[np.ndarray, "batch objects 3"]:
+    """Principal moments of inertia of bodies of uniform density [kg m^2]."""
+    columns = []
+    for i, shape in enumerate(batch.shapes):
+        x, y, z = np.moveaxis(batch.size[:, i], -1, 0)
+        if shape == "sphere":
+            unit = np.stack([0.4 * x**2] * 3, -1)
+        elif shape == "cylinder":
+            across = x**2 / 4 + (2 * y) ** 2 / 12
+            unit = np.stack([across, across, x**2 / 2], -1)
+        else:
+            unit = np.stack([y**2 + z**2, x**2 + z**2, x**2 + y**2], -1) / 3
+        columns.append(unit * batch.mass[:, i, None])
+    return np.stack(columns, 1)
+
+
+def apply_fields(model: mujoco.MjModel, fields: ModelFields, row: int) -> None:
+    """Writes candidate ``row`` into ``model`` in place, as the compiler would have."""
+    model.geom_size[1:] = fields.geom_size[row]
+    model.geom_rbound[1:] = fields.geom_rbound[row]
+    model.geom_aabb[1:, 3:] = _half_extents(model, fields.geom_size[row])
+    model.body_mass[1:] = fields.body_mass[row]
+    model.body_subtreemass[1:] = fields.body_mass[row]
+    model.body_subtreemass[0] = fields.body_mass[row].sum()
+    model.body_inertia[1:] = fields.body_inertia[row]
+    model.body_invweight0[1:] = fields.body_invweight0[row]
+    dof = np.repeat(fields.body_invweight0[row], 3, axis=-1)
+    model.dof_invweight0[:] = dof.reshape(-1)
+    mass_matrix = np.concatenate([np.repeat(fields.body_mass[row][:, None], 3, 1), fields.body_inertia[row]], -1)
+    model.dof_M0[:] = mass_matrix.reshape(-1)
+    model.stat.meaninertia = mass_matrix.mean()
+    model.pair_friction[:] = fields.pair_friction[row]
+    model.pair_solref[:] = fields.pair_solref[row]
+    model.pair_solreffriction[:] = fields.pair_solreffriction[row]
+    model.opt.gravity[:] = fields.gravity[row]
+
+
+def _half_extents(model: mujoco.MjModel, size: np.ndarray) -> np.ndarray:
+    half = size.copy()
+    for i, kind in enumerate(model.geom_type[1:]):
+        if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+            half[i] = size[i, 0]
+        elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+            half[i] = size[i, 0], size[i, 0], size[i, 1]
+    return half
+
+
+def initial_state(batch: SceneBatch) -> tuple[np.ndarray, np.ndarray]:
+    """``qpos`` (B, 7N) and ``qvel`` (B, 6N) of the first frame."""
+    qpos = np.concatenate([batch.position, batch.quaternion], -1).reshape(len(batch), -1)
+    qvel = np.concatenate([batch.linear_velocity, batch.angular_velocity], -1).reshape(len(batch), -1)
+    return qpos, qvel
