@@ -1,0 +1,183 @@
+"""The parameter space of a scene: named physical quantities on one side, the unit box on the other."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mjx_refine.batch import SceneBatch, batch_from_scenes, scene_from_batch
+from mjx_refine.scene import Scene
+from mjx_refine.space import rotations
+from mjx_refine.space.layout import body_parameters, is_upright, lowest_extent, world_parameters
+from mjx_refine.space.parameter import Parameter
+
+
+@dataclasses.dataclass(frozen=True)
+class Space:
+    """All free parameters around a starting scene.
+
+    Attributes:
+      scene: the start; whatever is no parameter stays as it is there.
+      parameters: the coordinates of the unit box, in order.
+      fixed: (name, reason) of what is held at its start.
+    """
+
+    scene: Scene
+    parameters: tuple[Parameter, ...]
+    fixed: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def around(cls, scene: Scene) -> Space:
+        """The space of everything that a clip could tell about ``scene``.
+
+        Fixed from the outset: the mass of a lone object and, of several, that of the first (only ratios act), a sphere's
+        orientation and a cylinder's turn about its axis (they cannot be seen), contact stiffness (bounce is damping's).
+        """
+        batch = batch_from_scenes([scene])
+        parameters: list[Parameter] = []
+        fixed: list[tuple[str, str]] = []
+        for i, body in enumerate(scene.objects):
+            extent = lowest_extent(body.shape, batch.size[0, i], batch.quaternion[0, i])
+            gap = max(float(batch.position[0, i, 2] - extent), 0.0)
+            parameters += body_parameters(i, body, gap, lone=i == 0)
+            fixed += _fixed_of_body(body.name, body.shape, i, len(scene.objects))
+        parameters += world_parameters(scene)
+        return cls(scene, tuple(parameters), tuple(fixed))
+
+    @property
+    def dimension(self) -> int:
+        return len(self.parameters)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def start(self) -> Float[np.ndarray, "dimension"]:
+        """The starting scene in the unit box."""
+        return np.array([p.to_unit(p.start) for p in self.parameters])
+
+    @property
+    def sigma(self) -> Float[np.ndarray, "dimension"]:
+        """Prior standard deviations in the unit box."""
+        return np.array([p.sigma for p in self.parameters])
+
+    def freeze(self, held: Bool[np.ndarray, "dimension"], at: Float[np.ndarray, "dimension"], reason: str) -> Space:
+        """The space without the ``held`` coordinates, which keep their values ``at``."""
+        if held.shape != (self.dimension,):
+            raise ValueError(f"held has shape {held.shape}; expected ({self.dimension},)")
+        values = self.values(at)
+        parameters = tuple(p for p, h in zip(self.parameters, held, strict=True) if not h)
+        fixed = [(p.name, reason) for p, h in zip(self.parameters, held, strict=True) if h]
+        # The decoder starts from the scene, so that the held values must be in it.
+        base = dataclasses.replace(self, parameters=tuple(p for p, h in zip(self.parameters, held, strict=True) if h))
+        scene = base.scene_at(np.array([p.to_unit(v) for p, v in zip(base.parameters, values[held], strict=True)]))
+        return Space(scene, parameters, (*self.fixed, *fixed))
+
+    def values(self, u: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
+        """Physical values at one point of the unit box."""
+        u = self._checked(np.asarray(u, np.float64)[None])[0]
+        return np.array([p.from_unit(v) for p, v in zip(self.parameters, u, strict=True)])
+
+    def scene_at(self, u: Float[np.ndarray, "dimension"]) -> Scene:
+        """The scene at one point of the unit box."""
+        return scene_from_batch(self.decode(np.asarray(u)[None]), 0, self.scene)
+
+    def _checked(self, u: np.ndarray) -> np.ndarray:
+        if u.ndim != 2 or u.shape[1] != self.dimension:
+            raise ValueError(f"points have shape {u.shape}; expected (batch, {self.dimension})")
+        if not np.isfinite(u).all() or u.min(initial=0.0) < -1e-9 or u.max(initial=1.0) > 1 + 1e-9:
+            raise ValueError(f"points lie in [{u.min()}, {u.max()}]; expected finite numbers in the unit box")
+        return np.clip(u, 0.0, 1.0)
+
+    def decode(self, u: Float[np.ndarray, "batch dimension"]) -> SceneBatch:
+        """The candidates at points of the unit box.
+
+        Raises:
+          ValueError: wrong shape, not finite, or outside of the box.
+        """
+        u = self._checked(np.asarray(u, np.float64))
+        count = len(u)
+        base = batch_from_scenes([self.scene]).map(lambda a: np.repeat(a, count, 0))
+        raw = self._intermediate(base)
+        for j, parameter in enumerate(self.parameters):
+            i, k = parameter.index
+            target = raw[parameter.field]
+            target[(slice(None), k) if i < 0 else (slice(None), i, k)] = parameter.from_unit(u[:, j])
+        return self._assemble(base, raw)
+
+    def _intermediate(self, base: SceneBatch) -> dict[str, np.ndarray]:
+        count, objects = base.mass.shape
+        extent = self._extents(base.size, base.quaternion)
+        strength = np.linalg.norm(base.gravity, axis=-1, keepdims=True)
+        return {
+            "size": base.size.copy(),
+            "position": base.position.copy(),
+            "clearance": (base.position[..., 2] - extent)[..., None],
+            "yaw": np.zeros((count, objects, 1)),
+            "tilt": np.zeros((count, objects, 2)),
+            "lean": np.zeros((count, objects, 1)),
+            "linear_velocity": base.linear_velocity.copy(),
+            "spin": rotations.rotate(base.quaternion, base.angular_velocity),
+            "friction": base.friction.copy(),
+            "resistance": -base.damping[..., None],
+            "mass": base.mass[..., None].copy(),
+            "camera_position": base.camera_position.copy(),
+            "camera_pitch": base.camera_pitch[:, None].copy(),
+            "camera_fovy": base.camera_fovy[:, None].copy(),
+            "gravity": strength,
+        }
+
+    def _extents(self, size: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+        columns = [lowest_extent(s, size[:, i], quaternion[:, i]) for i, s in enumerate(self.scene.shapes)]
+        return np.stack(columns, 1)
+
+    def _assemble(self, base: SceneBatch, raw: dict[str, np.ndarray]) -> SceneBatch:
+        zeros = np.zeros_like(raw["yaw"])
+        vertical = rotations.exponential(np.concatenate([zeros, zeros, raw["yaw"]], -1))
+        lean = raw["lean"] * _lean_axes(self.scene)
+        tilt = rotations.exponential(np.concatenate([raw["tilt"], zeros], -1) + lean)
+        quaternion = rotations.normalise(rotations.multiply(vertical, rotations.multiply(tilt, base.quaternion)))
+        position = raw["position"].copy()
+        position[..., 2] = raw["clearance"][..., 0] + self._extents(raw["size"], quaternion)
+        strength = np.linalg.norm(base.gravity, axis=-1, keepdims=True)
+        return dataclasses.replace(
+            base,
+            size=raw["size"],
+            mass=raw["mass"][..., 0],
+            friction=raw["friction"],
+            damping=-raw["resistance"][..., 0],
+            position=position,
+            quaternion=quaternion,
+            linear_velocity=raw["linear_velocity"],
+            angular_velocity=rotations.rotate(rotations.conjugate(quaternion), raw["spin"]),
+            gravity=base.gravity * (raw["gravity"] / np.where(strength > 0, strength, 1.0)),
+            camera_position=raw["camera_position"],
+            camera_pitch=raw["camera_pitch"][:, 0],
+            camera_fovy=raw["camera_fovy"][:, 0],
+        )
+
+
+def _lean_axes(scene: Scene) -> Float[np.ndarray, "objects 3"]:
+    """For each lying cylinder the horizontal direction across its axis, zero for the others."""
+    axes = np.zeros((len(scene.objects), 3))
+    for i, body in enumerate(scene.objects):
+        if body.shape == "cylinder" and not is_upright(body):
+            axis = rotations.matrix(np.array(body.orientation))[:, 2]
+            across = np.cross([0.0, 0.0, 1.0], axis)
+            axes[i] = across / np.linalg.norm(across)
+    return axes
+
+
+def _fixed_of_body(name: str, shape: str, i: int, count: int) -> list[tuple[str, str]]:
+    fixed = [(f"{name}.stiffness", "bounce is fitted by damping")]
+    if i == 0:
+        reason = "nothing else in the scene to compare it with" if count == 1 else "only ratios of masses act"
+        fixed.append((f"{name}.mass", reason))
+    if shape == "sphere":
+        fixed.append((f"{name}.orientation", "a sphere's outline does not show it"))
+    if shape == "cylinder":
+        fixed.append((f"{name}.turn", "a cylinder's outline does not show its turn about the axis"))
+    return fixed
