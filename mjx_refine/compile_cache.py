@@ -1,0 +1,63 @@
+"""Compilers' caches on disk, and a line on stderr for every compilation, since each takes from seconds to minutes."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+
+log = logging.getLogger("mjx_refine")
+
+VARIABLE = "MJX_REFINE_CACHE"
+"""Environment variable that names the cache folder; ``off`` turns the caches off."""
+
+
+def cache_folder() -> Path | None:
+    """The folder of the caches: what MJX_REFINE_CACHE says, else the user's cache folder; None where it is off."""
+    chosen = os.environ.get(VARIABLE)
+    if chosen and chosen.lower() in ("0", "off", "none"):
+        return None
+    if chosen:
+        return Path(chosen).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mjx-refine"
+
+
+def enable_cache() -> Path | None:
+    """Makes JAX, and Warp where it is installed, keep compiled programs on disk.
+
+    A cache is a convenience: where its folder cannot be written, a warning is logged and compilation goes on without.
+
+    Returns:
+      the folder, or None where there is no cache.
+    """
+    folder = cache_folder()
+    if folder is None:
+        return None
+    try:
+        (folder / "jax").mkdir(parents=True, exist_ok=True)
+        (folder / "warp").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        log.warning("%s: no compilation cache (%s); set %s to another folder", folder, error.strerror, VARIABLE)
+        return None
+    jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    try:
+        import warp
+    except ImportError:
+        return folder
+    warp.config.kernel_cache_dir = str(folder / "warp")
+    return folder
+
+
+@contextlib.contextmanager
+def compiling(what: str) -> Iterator[None]:
+    """Logs that ``what`` is being compiled, and how long it took [s]."""
+    log.info("compiling %s ...", what)
+    start = time.perf_counter()
+    yield
+    log.info("compiled %s in %.1f s", what, time.perf_counter() - start)

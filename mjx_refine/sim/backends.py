@@ -1,0 +1,66 @@
+"""Which engine simulates: C MuJoCo on CPUs, MJX-Warp on NVIDIA GPUs, MJX-JAX anywhere and for gradients."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.errors import InputError
+from mjx_refine.scene import Shape
+
+BACKENDS = ("auto", "mjx", "warp", "mujoco")
+
+
+class Simulator(Protocol):
+    """What every backend offers."""
+
+    name: str
+    device: str
+    shapes: tuple[Shape, ...]
+    fps: float
+
+    def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
+        """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged."""
+        ...
+
+
+def resolve_backend(name: str) -> str:
+    """The backend that ``name`` means here: ``auto`` is warp where Warp and an NVIDIA GPU are, else mujoco.
+
+    Raises:
+      InputError: no such backend, or warp where it cannot run.
+    """
+    if name not in BACKENDS:
+        raise InputError(f"backend {name!r}; expected one of {', '.join(BACKENDS)}")
+    if name not in ("auto", "warp"):
+        return name
+    from mjx_refine.sim.warp import REMEDY, warp_problem
+
+    problem = warp_problem()
+    if problem and name == "warp":
+        raise InputError(f"backend warp: {problem}; {REMEDY}")
+    return "mujoco" if problem else "warp"
+
+
+def make_simulator(name: str, shapes: tuple[Shape, ...], fps: float) -> Simulator:
+    """A simulator of the scene kind ``shapes`` at ``fps`` frames a second.
+
+    Raises:
+      InputError: no such backend, or one that cannot run here.
+    """
+    name = resolve_backend(name)
+    # Imported here, because JAX takes a second to import and C MuJoCo does without.
+    if name == "warp":
+        from mjx_refine.sim.warp import WarpSimulator
+
+        return WarpSimulator(shapes, fps)
+    if name == "mjx":
+        from mjx_refine.sim.mjx import MjxSimulator
+
+        return MjxSimulator(shapes, fps)
+    from mjx_refine.sim.c import MujocoSimulator
+
+    return MujocoSimulator(shapes, fps)

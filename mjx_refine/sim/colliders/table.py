@@ -1,0 +1,2 @@
+"""Which collider of ours serves which pairing."""
+COLLIDERS = {}

@@ -1,0 +1,121 @@
+"""MJX-Warp: MuJoCo's own algorithms as CUDA kernels, called from JAX; for NVIDIA GPUs."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from mujoco import mjx
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.compile_cache import compiling
+from mjx_refine.errors import InputError
+from mjx_refine.scene import Shape
+from mjx_refine.sim.leaves import Leaves, candidate_model, leaves_of
+from mjx_refine.sim.mjx import diverged_to_nan, padded
+from mjx_refine.sim.model import SUBSTEPS, build_spec, contact_pairs, initial_state
+
+REMEDY = "pip install 'mjx-refine[warp]' on a machine with an NVIDIA GPU, or choose --backend mujoco"
+
+_POINTS = {("floor", "sphere"): 1, ("floor", "box"): 8, ("floor", "cylinder"): 4}
+
+
+def warp_problem() -> str | None:
+    """Why MJX-Warp cannot run here, or None where it can."""
+    if importlib.util.find_spec("warp") is None:
+        return "the package warp-lang is not installed"
+    try:
+        found = jax.devices("cuda")
+    except RuntimeError:
+        found = []
+    return None if found else "JAX sees no NVIDIA GPU"
+
+
+def contact_points(shapes: tuple[Shape, ...]) -> int:
+    """The most contacts that one candidate can have: per pair, those of MuJoCo's colliders."""
+    total = 0
+    for first, second in contact_pairs(len(shapes)):
+        kinds = ("floor" if first < 0 else shapes[first], shapes[second])
+        total += 1 if "sphere" in kinds else _POINTS.get(kinds, 8)
+    return total
+
+
+class WarpSimulator:
+    """Batched rollouts in MJX-Warp.
+
+    Args:
+      shapes: the scene kind.
+      fps: frames a second; the time step is 1 / (8 fps).
+      iterations: Newton iterations a step at most.
+      ls_iterations: line-search iterations a Newton iteration at most.
+      any_device: also run on a CPU (through Warp's CPU kernels, slow; for tests).
+
+    Raises:
+      InputError: Warp is not installed, or there is no NVIDIA GPU.
+    """
+
+    name = "warp"
+
+    def __init__(
+        self,
+        shapes: tuple[Shape, ...],
+        fps: float,
+        iterations: int = 20,
+        ls_iterations: int = 20,
+        any_device: bool = False,
+    ):
+        problem = warp_problem()
+        if problem and not (any_device and importlib.util.find_spec("warp")):
+            raise InputError(f"backend warp: {problem}; {REMEDY}")
+        self.shapes = shapes
+        self.fps = fps
+        self.device = jax.devices()[0].device_kind
+        self._mujoco = build_spec(shapes, fps).compile()
+        self._mujoco.opt.iterations = iterations
+        self._mujoco.opt.ls_iterations = ls_iterations
+        self._model = mjx.put_model(self._mujoco, impl="warp")
+        self._programs: dict[tuple[int, int], jax.stages.Compiled] = {}
+
+    def _data(self, size: int) -> mjx.Data:
+        """Empty data with room for the contacts of ``size`` candidates."""
+        points = contact_points(self.shapes)
+        # Warp keeps one list of contacts for all candidates, and constraint rows for each: six a contact.
+        return mjx.make_data(self._mujoco, impl="warp", naconmax=size * points, njmax=6 * points)
+
+    def _trajectory(
+        self, data: mjx.Data, leaves: Leaves, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], frames: int
+    ) -> Float[Array, "frames objects 7"]:
+        model = candidate_model(self._model, leaves, self.shapes)
+
+        def substep(data, _):
+            return mjx.step(model, data), None
+
+        def frame(data, _):
+            data, _ = jax.lax.scan(substep, data, None, length=SUBSTEPS)
+            return data, data.qpos
+
+        start = data.replace(qpos=qpos, qvel=qvel)
+        _, later = jax.lax.scan(frame, start, None, length=frames - 1)
+        return jnp.concatenate([qpos[None], later]).reshape(frames, len(self.shapes), 7)
+
+    def _program(self, arguments: tuple[Leaves, jax.Array, jax.Array], frames: int) -> jax.stages.Compiled:
+        size = len(arguments[1])
+        if (size, frames) not in self._programs:
+            with compiling(f"MJX-Warp physics of {'+'.join(self.shapes)}, {size} candidates, {frames} frames"):
+                data = self._data(size)
+                program = jax.jit(jax.vmap(lambda *one: self._trajectory(data, *one, frames)))
+                self._programs[size, frames] = program.lower(*arguments).compile()
+        return self._programs[size, frames]
+
+    def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
+        """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged."""
+        if batch.shapes != self.shapes:
+            raise ValueError(f"scene kind {batch.shapes}; this simulator was made for {self.shapes}")
+        full = padded(batch)
+        qpos, qvel = initial_state(full)
+        arguments = (leaves_of(full), jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
+        poses = self._program(arguments, frames)(*arguments)
+        return diverged_to_nan(np.asarray(poses, np.float64)[: len(batch)])
