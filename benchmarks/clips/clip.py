@@ -15,6 +15,8 @@ from benchmarks.clips.bullet import Motion
 from benchmarks.clips.camera import Camera
 from benchmarks.clips.scenes import Entry, draw_scene
 
+STAYS = 0.5
+
 
 @dataclass(frozen=True)
 class Clip:
@@ -161,7 +163,8 @@ def mask_fault(masks: Int[np.ndarray, "frames height width"], count: int, frames
     """Why the masks disqualify a clip, or None.
 
     As the paper's filters: each object shows 8,000 pixels in total at 480x320 and 30 frames (in proportion at other
-    sizes), all show in the first frame, and never is more than one out of view (with a single object, none).
+    sizes), all show in the first frame, and never is more than one out of view (with a single object, none). And the
+    first frame's silhouette, held still, must not explain the clip: its mean IoU with the others stays under STAYS.
     """
     area = np.stack([(masks == i + 1).sum((1, 2)) for i in range(count)], 1)
     share = masks[0].size / (480 * 320)
@@ -171,4 +174,8 @@ def mask_fault(masks: Int[np.ndarray, "frames height width"], count: int, frames
         return "hidden at the start"
     if ((area == 0).sum(1) > min(1, count - 1)).any():
         return "out of view"
+    shown = masks > 0
+    stays = (shown & shown[0]).sum((1, 2)) / (shown | shown[0]).sum((1, 2))
+    if stays.mean() > STAYS:
+        return "too much stays where it is"
     return None

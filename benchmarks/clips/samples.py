@@ -22,6 +22,7 @@ from benchmarks.clips.camera import Camera
 
 Entry = dict[str, Any]
 MEAN_IOU, BEST_IOU, FIRST_IOU = 0.30, 0.38, (0.55, 0.75)
+WILDEST = 2.6
 COMMON = 0.7  # share of the error's amplitude that all samples of a clip have in common
 
 
@@ -132,7 +133,7 @@ def _guess_turn(original: Entry, lift: float, noise: _Noise, still: float) -> li
 def _guess_motion(state: Entry, original: Entry, ratio: float, noise: _Noise, moving: float, digits: int) -> None:
     velocity = np.array(original["linear_velocity"])
     turn = rotation.matrix(rotation.about(np.array([0.0, 0, 1]), noise(0.35 * moving)))
-    velocity = turn @ velocity * ratio * np.exp(noise(0.45 * moving))
+    velocity = turn @ velocity * ratio * np.exp(np.clip(noise(0.45 * moving), -0.8, 0.7))
     drift = noise(0.25 * moving, (3,))
     vertical = noise(0.4 * moving)
     drift[2] = vertical if abs(velocity[2]) > 0.05 else 0.0
@@ -182,7 +183,8 @@ def rough_samples(
       pool: guesses drawn for each try at the errors' scales; up to four pools are drawn.
 
     Raises:
-      ValueError: no scale of errors gives such samples for this clip (the mean is off by more than 0.02).
+      ValueError: only wild velocities, or nothing, give such samples for this clip (mean within 0.02, best within
+        0.02): too much of it rests. Take another clip.
     """
     _, height, width = masks.shape
     rng = np.random.default_rng([seed, 5])
@@ -198,8 +200,13 @@ def rough_samples(
             return float(np.median([sample_iou(s, masks[:1], fps=fps, stride=stride)[0] for s in scenes]))
         return float(np.median([sample_iou(s, masks, fps=fps, stride=stride, every=5).mean() for s in scenes]))
 
-    still = _solve(lambda s: probe(s, 1.0, True), 0.66, 0.2, 2.5)
-    moving = _solve(lambda m: probe(still, m, False), 0.31, 0.2, 5.0)
+    for first in (0.66, 0.60, 0.56):  # rather a worse first frame than wild velocities
+        still = _solve(lambda s: probe(s, 1.0, True), first, 0.2, 2.5)
+        moving = _solve(lambda m: probe(still, m, False), 0.31, 0.2, 5.0)
+        if moving < 1.5:
+            break
+    if moving > WILDEST:
+        raise ValueError(f"velocities must be wrong {moving:.1f} times as much as usual to miss this clip")
     drawn: list[list[Entry]] = []
     table = np.zeros((0, 2))
     for attempt in range(4):

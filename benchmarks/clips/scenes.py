@@ -39,9 +39,7 @@ def draw_scene(rng: np.random.Generator, kind: str, objects: int, size: tuple[in
     if kind == "collision":
         entries += _collision(rng, camera, gravity)
     while len(entries) < objects:
-        motion = (
-            kind if not entries else str(rng.choice(["rest", "slide", "roll", "bounce"], p=[0.35, 0.25, 0.25, 0.15]))
-        )
+        motion = kind if not entries else str(rng.choice(["rest", "slide", "roll", "bounce"], p=[0.2, 0.3, 0.3, 0.2]))
         for _ in range(30):
             entry = _DRAW[motion](rng, camera, gravity)
             if all(_apart(entry, other) for other in entries):
