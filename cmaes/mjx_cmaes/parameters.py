@@ -47,9 +47,9 @@ class Parameters:
     """Of the coordinates' scales; None without diagonal acceleration."""
 
 
-# Step-size damping against (T 55). A population of 128 for 20-84 coordinates gives a far better estimate of the
-# path than the default assumes; measured on development seeds by benchmarks/search.py's functions.
-DAMPING = 1.0
+# In a few dimensions a large population would replace C outright, and points that projection makes equal would then
+# leave it singular: C remembers at least this part's complement. Matters below 8 dimensions only.
+FULL_RATE_LIMIT = 0.5
 
 
 @lru_cache(maxsize=64)
@@ -73,9 +73,8 @@ def parameters(dimension: int, population: int, diagonal_acceleration: bool) -> 
         return Rates(c_c, c_1, c_mu, better / better.sum() - bound * worse / worse.sum())  # (T 53)
 
     if diagonal_acceleration:
-        full = rates(*_accelerated(n, population, mu_eff, n * (n + 1) / 2))
-        diagonal = rates(*_accelerated(n, population, mu_eff, n))
-        d_sigma *= DAMPING
+        full = rates(*_accelerated(n, population, mu_eff, n * (n + 1) / 2, FULL_RATE_LIMIT))
+        diagonal = rates(*_accelerated(n, population, mu_eff, n, 1.0))
     else:
         c_c = (4 + mu_eff / n) / (n + 4 + 2 * mu_eff / n)  # (T 56)
         c_1 = 2 / ((n + 1.3) ** 2 + mu_eff)  # (T 57)
@@ -93,8 +92,8 @@ def parameters(dimension: int, population: int, diagonal_acceleration: bool) -> 
     )
 
 
-def _accelerated(n: int, population: int, mu_eff: float, freedom: float) -> tuple[float, float, float]:
+def _accelerated(n: int, population: int, mu_eff: float, freedom: float, most: float) -> tuple[float, float, float]:
     """Path decay and learning rates for a part of the covariance with `freedom` degrees of freedom (D, 3.3)."""
     c_1 = 1 / (2 * (freedom / n + 1) * (n + 1) ** 0.75 + mu_eff / 2)
     mu = mu_eff + 1 / mu_eff - 2 + population / (2 * (population + 5))
-    return math.sqrt(mu_eff * c_1) / 2, c_1, min(mu * c_1, 1 - c_1)
+    return math.sqrt(mu_eff * c_1) / 2, c_1, min(mu * c_1, most * (1 - c_1))

@@ -30,7 +30,7 @@ _REALS = ("sigma", "path_full_weight", "path_diagonal_weight", "best_cost")
 
 def save_state(state: State) -> dict[str, np.ndarray]:
     """The state as arrays (float64 and int64), one a field, beside `version`; a search goes on from it bit for bit."""
-    arrays = {"version": np.asarray(VERSION, dtype=np.int64)}
+    arrays: dict[str, np.ndarray] = {"version": np.asarray(VERSION, dtype=np.int64)}
     for field in fields(State):
         value = getattr(state, field.name)
         real = field.name in _ARRAYS or field.name in _REALS

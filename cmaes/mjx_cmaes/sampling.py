@@ -32,7 +32,9 @@ def ask(settings: Settings, state: State) -> tuple[Points, State]:
 
 
 def inject(points: Points, given: Float[np.ndarray, "given dimension"]) -> Points:
-    """The generation `points` with its last rows replaced by `given`, shape (population, n).
+    """The generation `points` with its first rows replaced by `given`, shape (population, n).
+
+    First, because the first of equally good points is the one that is kept.
 
     `tell` notices rows that `ask` did not draw and limits their steps (`Settings.injection_limit`).
     Raises ValueError where there are more given points than rows, or their shape is wrong.
@@ -41,7 +43,7 @@ def inject(points: Points, given: Float[np.ndarray, "given dimension"]) -> Point
     fits = given.ndim == 2 and given.shape[1] == points.shape[1] and len(given) <= len(points)
     require(fits, "given.shape", given.shape, f"(at most {len(points)}, {points.shape[1]})")
     require(bool(np.isfinite(given).all()), "given", "a non-finite coordinate", "finite numbers")
-    return np.concatenate([points[: len(points) - len(given)], given])
+    return np.concatenate([given, points[len(given) :]])
 
 
 def _mirror(normal: Points) -> Points:

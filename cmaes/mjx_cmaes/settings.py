@@ -15,7 +15,7 @@ def require(condition: bool, name: str, value: object, expectation: str) -> None
 
 
 def _is_count(value: object, least: int) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= least
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= least)
 
 
 def _is_number(value: object) -> bool:
@@ -55,8 +55,9 @@ class Settings:
     """Stop once every coordinate's standard deviation is below this (box units)."""
     tolerance_cost: float = 1e-12
     """Stop once the generations' best costs of the recent past lie within this. 0 never stops for it."""
-    condition_limit: float = 1e14
-    """Stop once the covariance's condition number (an upper bound of it) exceeds this."""
+    condition_limit: float = 1e13
+    """Stop once the condition number of C exceeds this. With diagonal acceleration C holds the correlations alone:
+    scales that differ, as of a coordinate that rests on a bound, are no harm."""
     patience: int = 10
     """Stop after this many generations in a row in which all costs were equal, or none was finite."""
 

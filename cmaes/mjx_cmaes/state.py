@@ -92,7 +92,7 @@ class Info:
     std_high: float
     """Smallest and largest standard deviation of a coordinate, box units."""
     condition: float
-    """Upper bound of the covariance's condition number."""
+    """Condition number of C (with diagonal acceleration: of the correlations)."""
 
 
 def init(

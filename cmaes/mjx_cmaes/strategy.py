@@ -17,8 +17,9 @@ from mjx_cmaes.settings import Settings, require
 from mjx_cmaes.state import Info, State, decompose
 from mjx_cmaes.types import Costs, Flags, Matrix, Points, Vector
 
-# Of the shrinkage that mirrored pairs cause in the path of σ under random selection, the part that is undone. All of it
-# is unbiased in R^n; at a bound, where projection pushes the mean inwards, less is better. Measured: 0, 0.5 and 1.
+# Of the shrinkage of σ's path that mirrored pairs cause under random selection, the part that is undone. 1 is unbiased in
+# R^n, but at a bound projection pushes the mean inwards and keeps σ large. Medians of 8 seeds at n = 84 for 0, 0.5, 1:
+# sphere on bounds 2.5e-6, 5.8e-6, 2.4e-5; rotated ellipsoid inside 530, 489, 384; elsewhere much the same.
 MIRROR_CORRECTION = 0.5
 # Above this condition of the correlations the scales learn more slowly (D, beta_thresh).
 CORRELATION_THRESHOLD = 2.0
@@ -235,8 +236,8 @@ def _info(state: State, costs: Costs, distinct: int, injected: int) -> Info:
 
 
 def condition(state: State) -> float:
-    """Upper bound of the condition number of S C S, from those of its factors."""
-    return float((state.axes.max() / state.axes.min() * state.scale.max() / state.scale.min()) ** 2)
+    """Condition number of C, at the last decomposition."""
+    return float((state.axes.max() / state.axes.min()) ** 2)
 
 
 def _checked(settings: Settings, state: State, points: Points, costs: Costs) -> tuple[Points, Costs]:
