@@ -16,7 +16,7 @@ from mjx_cmaes.strategy import tell
 from mjx_cmaes.types import Costs, Matrix, Points, Vector
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Result:
     """What a search found."""
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rates:
     """How fast one part of the covariance learns."""
 
@@ -29,7 +29,7 @@ class Rates:
     """Recombination weights, best first, negative for the worse half; the positive ones sum to 1."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Parameters:
     """All constants of the update."""
 

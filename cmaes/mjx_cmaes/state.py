@@ -12,7 +12,7 @@ from mjx_cmaes.settings import Settings, require
 from mjx_cmaes.types import Matrix, Vector
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class State:
     """Everything the next generation depends on.
 

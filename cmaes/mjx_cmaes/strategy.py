@@ -29,7 +29,7 @@ WIDEN_WHEN_ALL_TIE = 1.1
 SMALLEST = 1e-100
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Steps:
     """A generation in the distribution's own coordinates."""
 

@@ -211,7 +211,7 @@ def test_restarts_leave_a_local_optimum(where, growth):
     start = np.full(2, 0.25)
     single = minimize(cost, start, 0.02, settings=settings, iterations=400)
     assert single.best_cost == pytest.approx(0.1, abs=1e-6)
-    result = minimize(counted, start, 0.3, settings=settings, iterations=400, restarts=3)
+    result = minimize(counted, start, 0.3, settings=settings, iterations=1000, restarts=10)
     assert result.state.restarts >= 1
     assert result.best_cost <= single.best_cost + 1e-9
     assert (max(sizes) > 8) == (growth > 1)
