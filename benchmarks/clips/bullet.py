@@ -58,7 +58,14 @@ class World:
         ground = p.createMultiBody(0, p.createCollisionShape(p.GEOM_PLANE, physicsClientId=c), physicsClientId=c)
         # Bullet multiplies two bodies' numbers: with ones here the object's own numbers hold.
         p.changeDynamics(
-            ground, -1, lateralFriction=1, rollingFriction=0, spinningFriction=0, restitution=1, physicsClientId=c
+            ground,
+            -1,
+            lateralFriction=1,
+            rollingFriction=0,
+            spinningFriction=0,
+            restitution=1,
+            contactProcessingThreshold=0,
+            physicsClientId=c,
         )
         p.changeVisualShape(ground, -1, rgbaColor=[0, 0, 0, 0], physicsClientId=c)
         if folder is None:
@@ -106,6 +113,7 @@ class World:
             rollingFriction=physics["friction"][1],
             spinningFriction=0.005,
             restitution=bounce.restitution(physics["damping"]),
+            contactProcessingThreshold=0,  # otherwise Bullet brakes a body just before it touches, and it rebounds by chance
             linearDamping=0,
             angularDamping=0,
             activationState=p.ACTIVATION_STATE_DISABLE_SLEEPING,
