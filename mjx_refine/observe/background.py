@@ -76,7 +76,7 @@ def learn_background(
 
     Args:
       frames: RGB, in order of time, all seen by one still camera (or warped to one).
-      valid: where a frame shows anything; None is everywhere.
+      valid: where a frame may show the empty scene; None is everywhere.
 
     A pixel may hold two lasting states, for example background first and a stopped object later. The region of such
     pixels is shown in both states; the state whose outline shows no seam with what surrounds it is the background.
@@ -84,8 +84,48 @@ def learn_background(
     noise = temporal_noise(frames)
     states = _states(_even_brightness(frames), valid, noise)
     image, swapped = _choose(states, noise)
+    if valid is not None:
+        image = _fill_unknown(image.astype(np.float32), valid)
     spread = np.clip(cv2.GaussianBlur(states.spread, (0, 0), 1.5), 0.8 * noise, 4 * noise)
     return Background(image.astype(np.float32), spread.astype(np.float32), swapped)
+
+
+def find_motion(frames: UInt8[np.ndarray, "frames height width 3"]) -> Bool[np.ndarray, "frames height width"]:
+    """Roughly where each frame moves, from coarse flow to its neighbours in time; regions are filled.
+
+    An object that never leaves some pixels would otherwise become their background.
+    """
+    height, width = frames.shape[1:3]
+    scale = min(1.0, 200 / width)
+    size = (max(32, round(width * scale)), max(24, round(height * scale)))
+    greys = [cv2.cvtColor(cv2.resize(f, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY) for f in frames]
+    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    moving = np.zeros((len(frames), size[1], size[0]), bool)
+    for k, (first, second) in enumerate(itertools.pairwise(greys)):
+        even = np.clip(second * (np.median(first + 1.0) / np.median(second + 1.0)), 0, 255).astype(np.uint8)
+        changed = cv2.absdiff(cv2.GaussianBlur(first, (0, 0), 1), cv2.GaussianBlur(even, (0, 0), 1)) > 6
+        changed = ndimage.binary_dilation(changed, iterations=3)
+        for at, one, other in ((k, first, even), (k + 1, even, first)):
+            length = np.hypot(*np.moveaxis(dis.calc(one, other, None), -1, 0))
+            moving[at] |= (length > 0.6) & changed
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+    for region in moving:
+        closed = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
+        region[:] = ndimage.binary_fill_holes(closed)
+    full = [cv2.resize(m.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0 for m in moving]
+    return np.stack(full)
+
+
+def _fill_unknown(
+    image: Float[np.ndarray, "height width 3"], valid: Bool[np.ndarray, "frames height width"]
+) -> Float[np.ndarray, "height width 3"]:
+    """Continues the surroundings into pixels that no frame shows empty."""
+    unknown = valid.sum(0) < max(2, round(0.04 * len(valid)))
+    if not unknown.any() or unknown.all():
+        return image
+    levels = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+    filled = cv2.inpaint(levels, unknown.astype(np.uint8), 4, cv2.INPAINT_TELEA)
+    return np.where(unknown[..., None], filled.astype(np.float32), image)
 
 
 def _even_brightness(
@@ -182,22 +222,39 @@ def _choose(states: _States, noise: float) -> tuple[Float[np.ndarray, "height wi
     double = ndimage.binary_opening(double, np.ones((2, 2), bool))
     double = ndimage.binary_closing(double, np.ones((3, 3), bool)) & (contrast > 4 * noise)
     labels, sizes = _same_history(double, states)
-    swapped = 0
-    for label in np.argsort(-sizes):
-        if sizes[label] < 9:
+    changed = _swap(image, states, double, labels, sizes)
+    if changed.any():
+        # What is left of the same resting place: pieces that something else also passed.
+        beside = ndimage.binary_dilation(changed, iterations=4) & double & ~changed
+        labels, count = ndimage.label(beside, np.ones((3, 3), bool))
+        changed |= _swap(image, states, double & ~changed, labels, np.bincount(labels.ravel(), minlength=count + 1)[1:])
+    return image, int(np.count_nonzero(changed))
+
+
+def _swap(
+    image: Float[np.ndarray, "height width 3"],
+    states: _States,
+    double: Bool[np.ndarray, "height width"],
+    labels: Int[np.ndarray, "height width"],
+    sizes: Int[np.ndarray, " regions"],
+) -> Bool[np.ndarray, "height width"]:
+    """Puts the rarer state into ``image`` where it makes the fainter seam; returns where."""
+    changed = np.zeros(double.shape, bool)
+    for label in np.argsort(-sizes, kind="stable"):
+        if sizes[label] < 5:
             break
         rows, cols = np.nonzero(labels == label + 1)
         window = _window(rows, cols, labels.shape, 8)
         region = labels[window] == label + 1
-        elsewhere = double[window] & ~region & (states.share_second[window] > 0.3)
+        elsewhere = double[window] & ~region & ~changed[window] & (states.share_second[window] > 0.3)
         seam_first = _seam(states.first[window], image[window], region, elsewhere)
         seam_second = _seam(states.second[window], image[window], region, elsewhere)
         share, rival = states.share[window][region].mean(), states.share_second[window][region].mean()
         # The longer state has the prior: a rare one needs a clearer seam.
         if rival > 0.1 and seam_second < _SEAM_GAIN * seam_first * min(1.0, 0.6 + rival / max(share, 1e-6)):
             image[window][region] = states.second[window][region]
-            swapped += int(sizes[label])
-    return image, swapped
+            changed[window] |= region
+    return changed
 
 
 def _same_history(

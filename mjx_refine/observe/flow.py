@@ -30,9 +30,9 @@ class FlowField:
 
 
 def make_dis(width: int) -> cv2.DISOpticalFlow:
-    """Dense inverse search (Kroeger et al., ECCV 2016), medium preset, down to full resolution on small pictures."""
+    """Dense inverse search (Kroeger et al., ECCV 2016), medium preset, down to full resolution on small crops."""
     dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    if width <= 480:
+    if width <= 200:
         dis.setFinestScale(0)
     return dis
 
@@ -66,30 +66,39 @@ def measure_flow(
             for number in np.unique(masks[t][masks[t] > 0]):
                 here, there = masks[t] == number, masks[t + 1] == number
                 _measure_object((greys[t], greys[t + 1]), (here, there), (flow[t], sigma[t], forward))
-        still = ~ndimage.binary_dilation(objects, iterations=6)
-        quiet.append(_residual(flow[t], still))
+        grown = ndimage.binary_dilation(objects, iterations=10)
+        spread, smooth = _background_motion(flow[t], ~grown)
+        quiet.append(spread)
+        # Beside an object the window drags the background along; the mask knows that it is background.
+        dragged = np.hypot(*np.moveaxis(forward - smooth, -1, 0)) > max(0.4, 4 * spread)
+        flow[t][grown & dragged & (masks[t] == 0 if masks is not None else True)] = np.nan
     background = float(np.median(quiet)) if quiet else _FLOOR
     sigma = np.clip(np.maximum(sigma, max(background, _FLOOR)), _FLOOR, _CEILING)
     return FlowField(flow, sigma.astype(np.float32), max(background, _FLOOR))
 
 
-def _residual(flow: Float[np.ndarray, "height width 2"], still: Bool[np.ndarray, "height width"]) -> float:
-    """Robust spread of the flow about a smooth (affine) field, px."""
-    valid = still & np.isfinite(flow[..., 0])
-    rows, cols = np.nonzero(valid)
+def _background_motion(
+    flow: Float[np.ndarray, "height width 2"], still: Bool[np.ndarray, "height width"]
+) -> tuple[float, Float[np.ndarray, "height width 2"]]:
+    """Robust spread of the background's flow about an affine field, px, and that field."""
+    height, width = still.shape
+    rows, cols = np.nonzero(still & np.isfinite(flow[..., 0]))
     if len(rows) < 50:
-        return _FLOOR
+        return _FLOOR, np.zeros((height, width, 2), np.float32)
     pick = slice(None, None, max(1, len(rows) // 4000))
-    rows, cols = rows[pick], cols[pick]
-    basis = np.stack([np.ones(len(rows)), rows, cols], axis=1).astype(np.float64)
-    values = flow[rows, cols].astype(np.float64)
-    for _ in range(3):
-        fit, *_ = np.linalg.lstsq(basis, values, rcond=None)
+    rows, cols = rows[pick] / height, cols[pick] / width
+    basis = np.stack([np.ones(len(rows)), rows, cols], axis=1)
+    values = flow[still & np.isfinite(flow[..., 0])][pick].astype(np.float64)
+    fit = np.array([np.median(values, axis=0), [0, 0], [0, 0]])
+    for _ in range(4):
         rest = values - basis @ fit
         size = np.abs(rest).max(-1)
-        keep = size <= np.quantile(size, 0.8)
-        basis, values = basis[keep], values[keep]
-    return float(max(1.4826 * np.median(np.abs(rest)), np.sqrt(np.square(rest).mean()), 1e-3))
+        keep = size <= max(3 * float(np.median(size)), 1e-3)
+        fit, *_ = np.linalg.lstsq(basis[keep], values[keep], rcond=None)
+    rest = values - basis @ fit
+    ys, xs = np.mgrid[:height, :width]
+    plane = np.stack([np.ones_like(ys, float), ys / height, xs / width], axis=-1) @ fit
+    return float(1.4826 * np.median(np.abs(rest))), plane.astype(np.float32)
 
 
 def _disagreement(

@@ -30,6 +30,7 @@ class Blob:
       shadow: share of pixels that a shadow would explain.
       contrast: mean change against the background, levels.
       border: share of its outline that lies on the picture's border.
+      margin: distance to the picture's border, px.
     """
 
     top: int
@@ -39,6 +40,7 @@ class Blob:
     shadow: float
     contrast: float
     border: float
+    margin: int
 
     @cached_property
     def area(self) -> int:
@@ -166,11 +168,11 @@ def _without_shadow(
     region: Bool[np.ndarray, "h w"], change: Change, window: tuple[slice, slice], least_area: int
 ) -> Bool[np.ndarray, "h w"]:
     """Takes away shadow-like parts on the region's outside, where a body remains that no shadow explains."""
-    shadow = change.shadow[window] & region
+    shadow = _shadow_within(region, change, window) & region
     body = ndimage.binary_opening(region & ~shadow, _CROSS)
     if np.count_nonzero(body) < max(4, 0.12 * np.count_nonzero(region), 0.5 * least_area):
         return region
-    body = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(body, 3), _SQUARE, iterations=2)[3:-3, 3:-3])
+    body = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(body, 3), _SQUARE)[3:-3, 3:-3])
     kept = region & (body | ~shadow)
     labels, count = ndimage.label(kept, _CROSS)
     if count > 1:  # crumbs of penumbra
@@ -195,27 +197,64 @@ def refine_outline(
     difference = even - background
     if area < _TINY:
         size = np.linalg.norm(difference, axis=-1)
-        return _tidy(region & (size > 0.3 * np.quantile(size[region], 0.85)), area)
-    depth = ndimage.distance_transform_edt(np.pad(region, 1, constant_values=False))[1:-1, 1:-1]
+        clear = region & (size > 0.25 * np.quantile(size[region], 0.85))
+        return region & convex_hull(_tidy(clear, area))
+    shadow = _shadow_within(region, change, window)
+    allowed = region | (ndimage.binary_dilation(region, _SQUARE, iterations=2) & ~shadow)
+    for _ in range(3):  # the first inside may hold some shadow or halo
+        refined = _at_half_coverage(region, even, background, noise) & allowed
+        if not refined.any() or np.array_equal(refined, region):
+            break
+        region = refined
+    return _tidy(region, area)
+
+
+def _at_half_coverage(
+    region: Bool[np.ndarray, "h w"],
+    even: Float[np.ndarray, "h w 3"],
+    background: Float[np.ndarray, "h w 3"],
+    noise: Float[np.ndarray, "h w"],
+) -> Bool[np.ndarray, "h w"]:
+    depth = ndimage.distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1]
     core = depth > min(2.6, 0.5 * depth.max())
-    scale = max(2.0, 0.25 * float(np.sqrt(area / np.pi)))
+    scale = max(2.0, 0.25 * float(np.sqrt(np.count_nonzero(region) / np.pi)))
     weight = cv2.GaussianBlur(core.astype(np.float32), (0, 0), scale)
-    colour = cv2.GaussianBlur(difference * core[..., None], (0, 0), scale) / np.maximum(weight, 1e-6)[..., None]
-    squared = np.square(colour).sum(-1)
-    coverage = (difference * colour).sum(-1) / np.maximum(squared, 1e-6)
+    inside = cv2.GaussianBlur(even * core[..., None], (0, 0), scale) / np.maximum(weight, 1e-6)[..., None]
+    contrast = inside - background
+    squared = np.square(contrast).sum(-1)
+    coverage = ((even - background) * contrast).sum(-1) / np.maximum(squared, 1e-6)
     band = ndimage.binary_dilation(region, _SQUARE, iterations=3) & ~core & (weight > 1e-4)
     telling = np.sqrt(squared) > 5 * noise + 6
     refined = np.where(band & telling, coverage > 0.5, region)
-    return _tidy(refined, area)
+    return ndimage.binary_fill_holes(np.pad(refined, 1))[1:-1, 1:-1]
 
 
 def _tidy(region: Bool[np.ndarray, "h w"], area: int) -> Bool[np.ndarray, "h w"]:
-    """Fills holes and takes off hairs."""
+    """Fills holes and takes off what sticks out on thin stalks."""
     padded = ndimage.binary_fill_holes(np.pad(region, 2))
     if area >= _TINY:
         padded = ndimage.binary_closing(padded, _CROSS)
-        padded = ndimage.binary_opening(ndimage.binary_fill_holes(padded), _CROSS)
+        padded = _without_tails(ndimage.binary_opening(ndimage.binary_fill_holes(padded), _CROSS))
     return padded[2:-2, 2:-2]
+
+
+def _without_tails(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Opens with a disc of half the radius, but leaves the corners, which end near the opened shape."""
+    radius = float(np.sqrt(np.count_nonzero(region) / np.pi))
+    inscribed = float(ndimage.distance_transform_edt(np.pad(region, 1)).max())
+    reach = max(1, round(min(0.5 * radius, 0.6 * inscribed)))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    wide = np.pad(region, reach + 1).astype(np.uint8)
+    opened = cv2.morphologyEx(wide, cv2.MORPH_OPEN, kernel)[reach + 1 : -reach - 1, reach + 1 : -reach - 1] > 0
+    if not opened.any():
+        return region
+    far = ndimage.distance_transform_edt(~opened)
+    rest, count = ndimage.label(region & ~opened, _CROSS)
+    if count == 0:
+        return region
+    lengths = ndimage.maximum(far, rest, np.arange(1, count + 1))
+    tails = np.isin(rest, 1 + np.nonzero(np.asarray(lengths) > 1.0 + 0.22 * radius)[0])
+    return region & ~tails
 
 
 def make_blob(region: Bool[np.ndarray, "h w"], change: Change, window: tuple[slice, slice]) -> Blob | None:
@@ -236,21 +275,34 @@ def make_blob(region: Bool[np.ndarray, "h w"], change: Change, window: tuple[sli
         int(left),
         crop,
         even.mean(0),
-        _shadow_share(region, change, window),
+        float(_shadow_within(region, change, window)[region].mean()),
         float(np.abs(even - back).max(-1).mean()),
         float(edge.mean()),
+        int(min(top, left, height - top - crop.shape[0], width - left - crop.shape[1])),
     )
 
 
-def _shadow_share(region: Bool[np.ndarray, "h w"], change: Change, window: tuple[slice, slice]) -> float:
-    """Share of pixels that a shadow explains; on tiny regions fine detail in the brightness speaks against it."""
+def _shadow_within(
+    region: Bool[np.ndarray, "h w"], change: Change, window: tuple[slice, slice]
+) -> Bool[np.ndarray, "h w"]:
+    """Shadow-like pixels; on small regions, all edge, fine detail in the brightness speaks against it."""
     shadow = change.shadow[window]
-    if np.count_nonzero(region) < _TINY:
+    if np.count_nonzero(region) < 2 * _TINY:
         ratio = (change.even[window].sum(-1) + 18) / (change.background[window].sum(-1) + 18)
         depth = np.log(np.maximum(ratio, 1e-3)).astype(np.float32)
         detail = np.abs(depth - cv2.GaussianBlur(depth, (0, 0), 1.2)) > 0.09
         shadow = shadow & ~ndimage.binary_dilation(detail, _CROSS)
-    return float(shadow[region].mean())
+    return shadow
+
+
+def convex_hull(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose centres lie in the convex hull of the region's pixel centres."""
+    if not region.any():
+        return region
+    contours, _ = cv2.findContours(region.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    hull = np.zeros(region.shape, np.uint8)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(contours)), 1)
+    return hull > 0
 
 
 def convex_fill(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
@@ -258,15 +310,13 @@ def convex_fill(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     area = np.count_nonzero(region)
     if area < 12:
         return region
-    contours, _ = cv2.findContours(region.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    hull = np.zeros(region.shape, np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(contours)), 1)
+    hull = convex_hull(region)
     # A hull of pixel centres bulges by part of a pixel over a digital disc; the closing takes that back.
     added = np.count_nonzero(hull) - area
     if added <= 0 or added > 0.25 * area:
         return region
-    size = 2 * max(2, round(0.35 * np.sqrt(area / np.pi))) + 1
+    size = 2 * max(2, round(0.5 * np.sqrt(area / np.pi))) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     padded = cv2.copyMakeBorder(region.astype(np.uint8), size, size, size, size, cv2.BORDER_CONSTANT, value=0)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, kernel)[size:-size, size:-size]
-    return region | ((closed > 0) & (hull > 0))
+    return region | ((closed > 0) & hull)

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from mjx_refine.observe.background import Background, learn_background
+from mjx_refine.observe.background import Background, find_motion, learn_background
 from mjx_refine.observe.camera import CameraMotion
-from mjx_refine.observe.foreground import Change, convex_fill, find_blobs, measure_change
+from mjx_refine.observe.foreground import Change, convex_fill, convex_hull, find_blobs, measure_change
 from mjx_refine.observe.selection import select_objects
 from mjx_refine.observe.tracking import Track, track_blobs
 from mjx_refine.observe.video import Clip
@@ -75,12 +75,7 @@ def _paint(objects: list[Track], frames: int, shape: tuple[int, int]) -> Int[np.
 
 def _is_convex(track: Track) -> bool:
     """Whether the object fills most of its convex hull in most frames."""
-    shares = []
-    for blob in track.blobs.values():
-        contours, _ = cv2.findContours(blob.crop.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        hull = np.zeros(blob.crop.shape, np.uint8)
-        cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(contours)), 1)
-        shares.append(blob.area / max(1, np.count_nonzero(hull)))
+    shares = [b.area / max(1, np.count_nonzero(convex_hull(b.crop))) for b in track.blobs.values()]
     return float(np.median(shares)) > 0.85
 
 
@@ -91,7 +86,8 @@ def _backgrounds(
 ]:
     """The empty scene and its noise as each frame's camera sees it, and the noise's median."""
     if not camera.moving:
-        background = learn_background(_related(clip))
+        frames = _related(clip)
+        background = learn_background(frames, ~find_motion(frames))
         return lambda t: (background.image, background.noise), float(np.median(background.noise))
     return _mosaic(clip, camera)
 

@@ -113,14 +113,23 @@ def _own_reason(track: Track, frames: int) -> str | None:
     life = len(track.blobs)
     if life < max(2, min(3, frames // 2), round(0.12 * frames)):
         return "seen in few frames only"
+    if life < 0.6 * frames and not (_entered(track, min(track.blobs), 0) and _entered(track, max(track.blobs), frames - 1)):
+        return "appearing or disappearing inside the picture, like a reflection"
     touching = np.mean([b.border > 0.03 for b in track.blobs.values()])
     if touching > 0.8:
         return "at the picture's border all the time, like a hand or a frame around the picture"
     areas = np.array([b.area for b in track.blobs.values() if b.border < 0.02], float)
+    if travelled(track) < 1.0 and (radius(track) < 4 or contrast(track) < 25):
+        return _ON_THE_SPOT
     still = travelled(track) < max(2.0, 0.25 * radius(track))
     if still and (life < 0.7 * frames or (len(areas) > 2 and areas.std() / areas.mean() > 0.3)):
         return _ON_THE_SPOT
     return None
+
+
+def _entered(track: Track, t: int, limit: int) -> bool:
+    """Whether the track's end at frame ``t`` is the clip's (``limit``) or lies at the picture's border."""
+    return t == limit or track.blobs[t].border > 0 or track.at_border(t)
 
 
 def _unmoved(track: Track, pictures: UInt8[np.ndarray, "frames height width 3"]) -> str | None:

@@ -41,6 +41,13 @@ class Track:
         frame, blob = self.latest(t, step)
         return blob.centre + self.velocity(t, step) * abs(t - frame)
 
+    def at_border(self, t: int) -> bool:
+        """Whether the blob at frame ``t`` is within one step of the picture's border."""
+        blob = self.blobs[t]
+        others = sorted(self.blobs, key=lambda f: abs(f - t))[1:2]
+        step = float(np.abs(self.blobs[others[0]].centre - blob.centre).max()) if others else 0.0
+        return blob.margin <= 2 + 1.5 * step
+
     def template(self, t: int, step: int) -> Blob:
         """The last outline that was not cut out of a shared region, else the last one."""
         frames = sorted((f for f in self.blobs if (t - f) * step > 0), key=lambda f: -f * step)
@@ -71,7 +78,40 @@ def track_blobs(
         while 0 <= t < len(blobs):
             _advance(tracks, blobs[t], t, step, shape, change_at)
             t += step
-    return tracks
+    return _link(tracks, float(np.hypot(*shape)))
+
+
+def _link(tracks: list[Track], diagonal: float) -> list[Track]:
+    """Joins tracks that end and begin alike within a few frames: one object after a sharp turn or a short gap."""
+    tracks = list(tracks)
+    while True:
+        pairs = [
+            (_link_cost(a, b, diagonal), i, j)
+            for i, a in enumerate(tracks)
+            for j, b in enumerate(tracks)
+            if 0 < min(b.blobs) - max(a.blobs) <= _PATIENCE
+        ]
+        best = min(pairs, default=(np.inf, 0, 0))
+        if best[0] >= 1:
+            return tracks
+        _, i, j = best
+        joined = Track({**tracks[i].blobs, **tracks[j].blobs}, tracks[i].shared | tracks[j].shared)
+        tracks = [k for n, k in enumerate(tracks) if n not in (i, j)] + [joined]
+
+
+def _link_cost(early: Track, late: Track, diagonal: float) -> float:
+    """Below 1 where two tracks can be one object's; the ends must look alike and be where either leads."""
+    end, start = max(early.blobs), min(late.blobs)
+    a, b = early.blobs[end], late.blobs[start]
+    colour = float(np.abs(a.colour - b.colour).max()) / 45
+    size = 0.0 if max(a.border, b.border) > 0.02 else abs(float(np.log(a.area / b.area))) / 0.7
+    speed = max(float(np.hypot(*early.velocity(start, 1))), float(np.hypot(*late.velocity(end, -1))))
+    ahead = np.hypot(*(early.predict(start, 1) - b.centre))
+    behind = np.hypot(*(late.predict(end, -1) - a.centre))
+    distance = min(ahead, behind) / (max(3 * a.radius, 0.06 * diagonal) + speed)
+    shadow = abs(a.shadow - b.shadow) / 0.6
+    worst = max(colour, size, float(distance), shadow)
+    return worst if worst < 1 else np.inf
 
 
 def _seed(blobs: list[list[Blob]]) -> int:
@@ -166,6 +206,10 @@ def _share(
             cover = max(
                 _cover(blob, place, shape), _cover(blob, _shifted(template, last.centre, shape), shape)
             )
+            both = others + template.area
+            near = float(np.hypot(*(blob.centre - track.predict(t, step)))) < 1.2 * (blob.radius + last.radius)
+            if near and 0.75 * both < blob.area < 1.3 * both:
+                cover = max(cover, 0.4)  # it has about the size of all of them together, and is where this one can be
             if cover > best_cover:
                 best, best_cover = j, cover
         if best is not None:
