@@ -271,6 +271,10 @@ def _same_history(
         linked = double[a] & double[b]
         linked &= np.abs(states.when[a] - states.when[b]) < 0.06
         linked &= np.abs(states.when_second[a] - states.when_second[b]) < 0.12
+        # Two neighbours may change at the same moment in opposite ways: one object arrives, another leaves.
+        same = _step(states.first[a], states.first[b]) + _step(states.second[a], states.second[b])
+        crossed = _step(states.first[a], states.second[b]) + _step(states.second[a], states.first[b])
+        linked &= same <= crossed
         pairs.append(np.stack([number[a][linked], number[b][linked]]))
     edges = np.concatenate(pairs, axis=1)
     graph = sparse.coo_matrix((np.ones(edges.shape[1]), (edges[0], edges[1])), shape=(height * width,) * 2)
@@ -281,6 +285,10 @@ def _same_history(
     labels[inside] = compact + 1
     sizes = np.bincount(compact) if compact.size else np.zeros(0, np.int64)
     return labels.reshape(height, width), sizes
+
+
+def _step(one: Float[np.ndarray, "h w 3"], other: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+    return np.abs(one - other).max(-1)
 
 
 def _window(rows: np.ndarray, cols: np.ndarray, shape: tuple[int, ...], margin: int) -> tuple[slice, slice]:

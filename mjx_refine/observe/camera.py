@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import cv2
@@ -41,7 +42,7 @@ def measure_camera(frames: UInt8[np.ndarray, "frames height width 3"]) -> Camera
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float).T
     identity = np.eye(3)
     to_first, steps, measured = [identity], [], 0
-    for previous, current in zip(greys[:-1], greys[1:], strict=True):
+    for previous, current in itertools.pairwise(greys):
         step = _step(previous, current)
         measured += step is not None
         step = identity if step is None else step
@@ -77,7 +78,17 @@ def _step(previous: np.ndarray, current: np.ndarray) -> Float[np.ndarray, "3 3"]
     )
     if fit is None or np.count_nonzero(inliers) < max(_LEAST_POINTS, 0.4 * np.count_nonzero(good)):
         return None
+    if not _everywhere(points[good].reshape(-1, 2)[inliers.ravel() > 0], previous.shape):
+        return None  # one textured object, not the scene
     return np.vstack([fit, [0, 0, 1]])
+
+
+def _everywhere(points: Float[np.ndarray, "points 2"], shape: tuple[int, ...]) -> bool:
+    """Whether the points lie in most parts of the picture."""
+    height, width = shape[:2]
+    cells = {(int(4 * y / height), int(4 * x / width)) for x, y in points}
+    span = np.ptp(points, axis=0) / [width, height]
+    return len(cells) >= 7 and bool((span > 0.5).all())
 
 
 def _spread_corners(grey: np.ndarray) -> np.ndarray | None:
@@ -92,7 +103,7 @@ def _spread_corners(grey: np.ndarray) -> np.ndarray | None:
             if points is not None:
                 strength = cv2.cornerMinEigenVal(grey[rows, cols], 5)
                 at = np.rint(points.reshape(-1, 2)).astype(int)
-                strong = strength[at[:, 1], at[:, 0]] > 4e-4
+                strong = strength[at[:, 1], at[:, 0]] > 1e-4
                 found.append(points.reshape(-1, 2)[strong] + [cols.start, rows.start])
     if not found:
         return None

@@ -118,9 +118,7 @@ def observe_clip(
     tell(1.0, "done")
     objects = _objects(masks, field)
     warnings += _object_warnings(masks, objects)
-    observation = make_observation(
-        field.flow, clip.fps, masks, clip.frames, field.sigma, source=os.fspath(path)
-    )
+    observation = make_observation(field.flow, clip.fps, masks, clip.frames, field.sigma, source=os.fspath(path))
     report = ObserveReport(
         tuple(warnings),
         objects,

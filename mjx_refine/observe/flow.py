@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy import ndimage
 
 _MARGIN = 12  # px around an object's crop
+_PLAY = 0.4  # px; how far an object's flow is expected to be from its rigid motion in the picture
 _FLOOR = 0.03  # px; DIS is never better
 _CEILING = 8.0  # px
 
@@ -73,7 +74,9 @@ def measure_flow(
         dragged = np.hypot(*np.moveaxis(forward - smooth, -1, 0)) > max(0.4, 4 * spread)
         flow[t][grown & dragged & (masks[t] == 0 if masks is not None else True)] = np.nan
     background = float(np.median(quiet)) if quiet else _FLOOR
-    sigma = np.clip(np.maximum(sigma, max(background, _FLOOR)), _FLOOR, _CEILING)
+    still = np.ones(sigma.shape, bool) if masks is None else masks[:-1] == 0
+    sigma[still] = np.maximum(sigma[still], background)
+    sigma = np.clip(sigma, _FLOOR, _CEILING)
     return FlowField(flow, sigma.astype(np.float32), max(background, _FLOOR))
 
 
@@ -129,8 +132,14 @@ def _measure_object(
     second = _on_plain(greys[1], there)[window]
     corner = np.array([window[1].start, window[0].start], np.float32)
     pixels = _pixels(window)
+    shift = _subpixel_shift(first, _sample(second, _moved(motion, pixels) - corner), here[window])
+    motion[:, 2] += motion[:, :2] @ shift
     aligned = _sample(second, _moved(motion, pixels) - corner)
     rest, error = _small_flow(first, aligned)
+    aperture = _texture_sigma(greys[0], here)[window]
+    # Where the object shows no texture it moves as a whole.
+    whole = np.median(rest[here[window]], axis=0)
+    rest = whole + (rest - whole) * (_PLAY**2 / (_PLAY**2 + np.square(aperture)))[..., None]
     guided = _moved(motion, pixels + rest) - pixels
     inside = here[window]
     landed = _lands(guided, there, window)
@@ -139,9 +148,9 @@ def _measure_object(
     plain_lands = _lands(plain[window], there, window)
     score_guided = cost_guided.mean() + 40 * np.mean(~landed[inside])
     score_plain = cost_plain.mean() + 40 * np.mean(~plain_lands[inside])
-    aperture = _texture_sigma(greys[0], here)[window]
     view_flow, view_sigma = flow[window], sigma[window]
-    if score_guided <= score_plain + 0.5:
+    # Plain flow explains flat insides as well as true flow does, so it has to be clearly better.
+    if score_guided <= 1.3 * score_plain + 2:
         view_flow[inside] = guided[inside]
         view_sigma[inside] = np.maximum(0.5 * error, _FLOOR)[inside]
         view_flow[inside & ((error > 2.0 + 0.3 * np.hypot(*np.moveaxis(guided, -1, 0))) & ~landed)] = np.nan
@@ -160,7 +169,9 @@ def _moved(motion: Float[np.ndarray, "2 3"], points: Float[np.ndarray, "h w 2"])
 
 def _sample(image: np.ndarray, points: Float[np.ndarray, "h w 2"]) -> np.ndarray:
     """The image at (column, row) points, bilinear."""
-    return cv2.remap(image, np.ascontiguousarray(points, np.float32), None, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+    return cv2.remap(
+        image, np.ascontiguousarray(points, np.float32), None, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE
+    )
 
 
 def _window(here: np.ndarray, there: np.ndarray) -> tuple[slice, slice]:
@@ -171,11 +182,34 @@ def _window(here: np.ndarray, there: np.ndarray) -> tuple[slice, slice]:
     )
 
 
-def _on_plain(grey: UInt8[np.ndarray, "height width"], region: np.ndarray) -> UInt8[np.ndarray, "height width"]:
-    """The object alone, on a plain ground that contrasts with it, so that the ground's texture pulls at nothing."""
-    mean = float(grey[region].mean())
-    ground = mean - 70 if mean > 128 else mean + 70
-    soft = cv2.GaussianBlur(region.astype(np.float32), (0, 0), 0.7)
+def _subpixel_shift(
+    first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"], region: Bool[np.ndarray, "h w"]
+) -> Float[np.ndarray, " 2"]:
+    """Displacement (x, y) of at most 2.5 px that is left between two aligned crops (ECC, Evangelidis & Psarakis 2008).
+
+    Outlines are whole pixels, so that their centroids are off by a fraction of one.
+    """
+    near = ndimage.binary_dilation(region, iterations=2).astype(np.uint8)
+    rule = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-4)
+    try:
+        _, matrix = cv2.findTransformECC(
+            first, second, np.eye(2, 3, dtype=np.float32), cv2.MOTION_TRANSLATION, rule, near, 3
+        )
+    except cv2.error:  # no contrast, or no convergence: the centroids have to do
+        return np.zeros(2, np.float32)
+    shift = matrix[:, 2].astype(np.float32)
+    return shift if float(np.hypot(*shift)) < 2.5 else np.zeros(2, np.float32)
+
+
+def _on_plain(
+    grey: UInt8[np.ndarray, "height width"], region: Bool[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width"]:
+    """The object with its true edges, fading into a plain ground of the background's mean, so that the background's
+    texture pulls at nothing."""
+    near = ndimage.binary_dilation(region, iterations=2)
+    ring = ndimage.binary_dilation(near, iterations=3) & ~near
+    ground = float(np.median(grey[ring])) if ring.any() else float(grey.mean())
+    soft = cv2.GaussianBlur(near.astype(np.float32), (0, 0), 1.0)
     return np.clip(np.rint(soft * grey + (1 - soft) * ground), 0, 255).astype(np.uint8)
 
 
@@ -262,7 +296,7 @@ def _texture_sigma(
     gy = cv2.Scharr(patch, cv2.CV_32F, 0, 1, scale=1 / 32) * inner
     xx, yy, xy = (9 * 9 * cv2.blur(g, (9, 9)) for g in (gx * gx, gy * gy, gx * gy))
     weaker = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-    noise, smoothing = 2.0, 2.5  # levels; and pixels over which neighbouring residuals hang together
+    noise, smoothing = 2.0, 1.0  # levels; and pixels over which neighbouring residuals hang together
     sigma = np.zeros(grey.shape, np.float32)
     sigma[window] = np.minimum(noise * smoothing / np.sqrt(np.maximum(weaker, 1e-3)), 3.0)
     return sigma

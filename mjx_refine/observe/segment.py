@@ -29,9 +29,7 @@ class Segmentation:
     pixel_noise: float
 
 
-def segment(
-    clip: Clip, camera: CameraMotion, progress: Callable[[float], object] = lambda share: None
-) -> Segmentation:
+def segment(clip: Clip, camera: CameraMotion, progress: Callable[[float], object] = lambda share: None) -> Segmentation:
     """Segments and tracks what moves against the background.
 
     Args:
@@ -81,9 +79,7 @@ def _is_convex(track: Track) -> bool:
 
 def _backgrounds(
     clip: Clip, camera: CameraMotion
-) -> tuple[
-    Callable[[int], tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]], float
-]:
+) -> tuple[Callable[[int], tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]], float]:
     """The empty scene and its noise as each frame's camera sees it, and the noise's median."""
     if not camera.moving:
         frames = _related(clip)
@@ -106,9 +102,7 @@ def _related(clip: Clip) -> UInt8[np.ndarray, "frames height width 3"]:
 
 def _mosaic(
     clip: Clip, camera: CameraMotion
-) -> tuple[
-    Callable[[int], tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]], float
-]:
+) -> tuple[Callable[[int], tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]], float]:
     height, width = clip.frames.shape[1:3]
     corners = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]], float).T
     reached = np.concatenate([m @ corners for m in camera.to_first], axis=1)
@@ -129,9 +123,7 @@ def _mosaic(
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         image = cv2.warpAffine(background.image, placed[t], (width, height), flags=flags)
         noise = cv2.warpAffine(background.noise, placed[t], (width, height), flags=flags)
-        unknown = cv2.warpAffine(
-            rarely.astype(np.uint8), placed[t], (width, height), flags=flags, borderValue=1
-        )
+        unknown = cv2.warpAffine(rarely.astype(np.uint8), placed[t], (width, height), flags=flags, borderValue=1)
         image[unknown > 0] = clip.frames[t][unknown > 0]  # nothing can be said there
         slope = np.abs(cv2.Laplacian(image.mean(-1), cv2.CV_32F))
         return image, noise + 0.15 * np.minimum(slope, 40)

@@ -113,7 +113,9 @@ def _own_reason(track: Track, frames: int) -> str | None:
     life = len(track.blobs)
     if life < max(2, min(3, frames // 2), round(0.12 * frames)):
         return "seen in few frames only"
-    if life < 0.6 * frames and not (_entered(track, min(track.blobs), 0) and _entered(track, max(track.blobs), frames - 1)):
+    if life < 0.6 * frames and not (
+        _entered(track, min(track.blobs), 0) and _entered(track, max(track.blobs), frames - 1)
+    ):
         return "appearing or disappearing inside the picture, like a reflection"
     touching = np.mean([b.border > 0.03 for b in track.blobs.values()])
     if touching > 0.8:
@@ -121,6 +123,13 @@ def _own_reason(track: Track, frames: int) -> str | None:
     areas = np.array([b.area for b in track.blobs.values() if b.border < 0.02], float)
     if travelled(track) < 1.0 and (radius(track) < 4 or contrast(track) < 25):
         return _ON_THE_SPOT
+    steps = np.hypot(*np.diff(path(track), axis=0).T)
+    if travelled(track) < 3 * radius(track) + 2 and steps.sum() > 3.5 * travelled(track):
+        return _ON_THE_SPOT
+    if len(steps) > 3 and np.median(steps) > 1.5:
+        turns = np.hypot(*np.diff(path(track), n=2, axis=0).T)
+        if np.median(turns) > 1.3 * np.median(steps):  # hops to and fro, where a body would go on
+            return _ON_THE_SPOT
     still = travelled(track) < max(2.0, 0.25 * radius(track))
     if still and (life < 0.7 * frames or (len(areas) > 2 and areas.std() / areas.mean() > 0.3)):
         return _ON_THE_SPOT
@@ -144,8 +153,12 @@ def _compare(tracks: list[Track]) -> list[tuple[str, list[Track]]]:
     shadows = [
         k
         for k in tracks
-        if any(_follows(k, other) and shadow_share(k) > shadow_share(other) + 0.1 for other in tracks if other is not k)
-        and shadow_share(k) > 0.45
+        if (
+            any(
+                _follows(k, other) and shadow_share(k) > shadow_share(other) + 0.1 for other in tracks if other is not k
+            )
+            and shadow_share(k) > 0.45
+        )
         or (clear and shadow_share(k) > 0.6)
     ]
     rest = [k for k in tracks if all(k is not s for s in shadows)]
@@ -159,13 +172,17 @@ def _compare(tracks: list[Track]) -> list[tuple[str, list[Track]]]:
         if _weight(k) < 0.05 * strongest
         or (contrast(k) < 0.3 * top and contrast(k) < 40 and _weight(k) < 0.4 * strongest)
     ]
-    return [
-        ("darker copies of the background, like shadows", shadows),
-        ("faint or tiny beside the objects, like reflections", faint),
-    ] if shadows and faint else (
-        [("darker copies of the background, like shadows", shadows)]
-        if shadows
-        else ([("faint or tiny beside the objects, like reflections", faint)] if faint else [])
+    return (
+        [
+            ("darker copies of the background, like shadows", shadows),
+            ("faint or tiny beside the objects, like reflections", faint),
+        ]
+        if shadows and faint
+        else (
+            [("darker copies of the background, like shadows", shadows)]
+            if shadows
+            else ([("faint or tiny beside the objects, like reflections", faint)] if faint else [])
+        )
     )
 
 

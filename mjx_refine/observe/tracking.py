@@ -55,9 +55,7 @@ class Track:
         return self.blobs[(whole or frames)[0]]
 
 
-def track_blobs(
-    blobs: list[list[Blob]], shape: tuple[int, int], change_at: Callable[[int], Change]
-) -> list[Track]:
+def track_blobs(blobs: list[list[Blob]], shape: tuple[int, int], change_at: Callable[[int], Change]) -> list[Track]:
     """Links blobs into tracks, from the frame where most objects stand apart to both ends of the clip.
 
     Args:
@@ -172,9 +170,7 @@ def _advance(
         if len(owners[j]) == 1:
             owners[j][0].blobs[t] = blob
         elif len(owners[j]) > 1:
-            for track, part in zip(
-                owners[j], _cut(owners[j], blob, t, step, shape, change_at(t)), strict=True
-            ):
+            for track, part in zip(owners[j], _cut(owners[j], blob, t, step, shape, change_at(t)), strict=True):
                 if part is not None:
                     track.blobs[t] = part
                     track.shared.add(t)
@@ -203,9 +199,7 @@ def _share(
             others = sum(k.template(t, step).area for k in owners[j])
             if not owners[j] or blob.area < max(1.15 * others, others + 0.3 * template.area):
                 continue
-            cover = max(
-                _cover(blob, place, shape), _cover(blob, _shifted(template, last.centre, shape), shape)
-            )
+            cover = max(_cover(blob, place, shape), _cover(blob, _shifted(template, last.centre, shape), shape))
             both = others + template.area
             near = float(np.hypot(*(blob.centre - track.predict(t, step)))) < 1.2 * (blob.radius + last.radius)
             if near and 0.75 * both < blob.area < 1.3 * both:
@@ -221,9 +215,7 @@ def _cover(blob: Blob, place: Bool[np.ndarray, "height width"], shape: tuple[int
     return np.count_nonzero(place & blob.paint(shape)) / count if count else 0.0
 
 
-def _shifted(
-    blob: Blob, centre: Float[np.ndarray, " 2"], shape: tuple[int, int]
-) -> Bool[np.ndarray, "height width"]:
+def _shifted(blob: Blob, centre: Float[np.ndarray, " 2"], shape: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
     """The blob's outline moved so that its centroid is at ``centre``, cut at the picture's border."""
     dx, dy = np.rint(centre - blob.centre).astype(int)
     rows, cols = np.nonzero(blob.crop)
@@ -252,9 +244,7 @@ def _cut(
     shades = np.stack([np.abs(colours - h).max(-1) for h in hues])
     nearest = np.zeros(len(rows), int)
     for _ in range(10):
-        depth = np.stack(
-            [_depth(b, c, shape)[rows, cols] for b, c in zip(templates, centres, strict=True)]
-        )
+        depth = np.stack([_depth(b, c, shape)[rows, cols] for b, c in zip(templates, centres, strict=True)])
         updated = (depth - weight * shades).argmax(0)
         moved = []
         for i, (template, centre) in enumerate(zip(templates, centres, strict=True)):
@@ -290,9 +280,7 @@ def _spread(
     return [c + shift for c in centres]
 
 
-def _depth(
-    blob: Blob, centre: Float[np.ndarray, " 2"], shape: tuple[int, int]
-) -> Float[np.ndarray, "height width"]:
+def _depth(blob: Blob, centre: Float[np.ndarray, " 2"], shape: tuple[int, int]) -> Float[np.ndarray, "height width"]:
     """Signed distance to the outline of ``blob`` moved to ``centre`` (subpixel), positive inside, px."""
     pad = 3
     crop = np.pad(blob.crop, pad)

@@ -120,7 +120,7 @@ def test_small_fast_object_keeps_its_flow(tmp_path):
     bodies = [("disc", line((15, 40), (15, 4), 12), 5.0, (250, 250, 250))]
     truth = clip_of(tmp_path / "clip.avi", bodies, textured(2))
     result = observe_clip(tmp_path / "clip.avi")
-    (_, score), = match(result.observation.masks, truth).values()
+    ((_, score),) = match(result.observation.masks, truth).values()
     assert score > 0.75
     flow = np.stack([np.nanmedian(result.observation.flow[t][truth[0, t]], axis=0) for t in range(11)])
     np.testing.assert_allclose(flow, np.tile([15, 4], (11, 1)), atol=0.6)
@@ -152,6 +152,7 @@ def test_flow_noise_covers_the_errors_on_a_turning_textured_disc(tmp_path):
     assert np.isfinite(error).mean() > 0.98
     assert np.nanmedian(np.abs(error)) < 0.25
     normal = np.nanmedian(np.abs(error)) / (0.6745 * np.median(sigma))
+    print(np.nanmedian(np.abs(error)), np.median(sigma))
     assert 0.2 < normal < 2.5
 
 
@@ -170,11 +171,11 @@ def test_object_that_stops_stays_masked_and_one_that_rests_at_first_is_masked_fr
 
 
 def test_touching_discs_of_one_colour_are_split_and_keep_their_ids(tmp_path):
-    frames, radius = 25, 12.0
-    left, right = line((30, 70), (4, 0), frames), line((124, 74), (0, 0), frames)
+    frames, radius = 32, 12.0
+    left, right = line((30, 70), (4, 0), frames), line((106, 74), (0, 0), frames)
     hit = int(np.argmin(np.abs(right[0, 0] - left[:, 0] - 2 * radius)))
     left[hit:] = left[hit]
-    right[hit:] = right[hit] + np.arange(frames - hit)[:, None] * np.array([3.5, 0.5])
+    right[hit:] = right[hit] + np.arange(frames - hit)[:, None] * np.array([4.25, 0.25])
     bodies = [("disc", left, radius, (235, 235, 240)), ("disc", right, radius, (235, 235, 240))]
     truth = clip_of(tmp_path / "clip.avi", bodies, textured(6))
     found = match(observe_clip(tmp_path / "clip.avi").observation.masks, truth)
@@ -213,7 +214,7 @@ def test_flicker_and_a_cast_shadow_do_not_widen_the_masks(tmp_path):
         before=shade,
     )
     result = observe_clip(tmp_path / "clip.avi")
-    (_, score), = match(result.observation.masks, truth).values()
+    ((_, score),) = match(result.observation.masks, truth).values()
     assert len(result.report.objects) == 1
     assert score > 0.83
 
@@ -229,7 +230,7 @@ def test_a_hand_at_the_border_and_a_clock_are_left_out_with_a_sentence(tmp_path)
     truth = clip_of(tmp_path / "clip.avi", bodies, textured(9), after=extras)
     result = observe_clip(tmp_path / "clip.avi")
     assert len(result.report.objects) == 1
-    (_, score), = match(result.observation.masks, truth).values()
+    ((_, score),) = match(result.observation.masks, truth).values()
     assert score > 0.85
     assert any("left out" in w and "border" in w for w in result.report.warnings)
 
@@ -249,7 +250,7 @@ def test_moving_camera_is_reported_and_objects_are_still_found(tmp_path):
     assert result.report.camera_moving
     assert any("camera moves" in w for w in result.report.warnings)
     assert abs(result.report.camera_drift - 38) < 2
-    (_, score), = match(result.observation.masks, truth).values()
+    ((_, score),) = match(result.observation.masks, truth).values()
     assert score > 0.8
     still = ~truth[0, 3]
     np.testing.assert_allclose(np.nanmedian(result.observation.flow[3][still], axis=0), [-2, 0], atol=0.1)
