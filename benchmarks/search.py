@@ -148,21 +148,25 @@ RUNNERS: dict[str, Callable[[Function, np.ndarray, int], float]] = {
 }
 
 
-def time_update(dimension: int = 84, generations: int = 200) -> tuple[float, float]:
-    """Median and 95th percentile of ask plus tell, ms, on the sphere (whose evaluation is left out)."""
+def time_update(dimension: int = 84, generations: int = 200) -> tuple[float, float, float]:
+    """Ask plus tell on the sphere, evaluation left out, ms: median wall, 95th percentile wall, mean processor time.
+
+    On a busy machine wall time tells of the neighbours, processor time of the update.
+    """
     function, start = problem("sphere", "inside", dimension, 0)
     settings = Settings(dimension, population=POPULATION)
     state = init(settings, start, STD)
-    times = []
+    wall, processor = [], 0.0
     for _ in range(generations):
-        begin = time.perf_counter()
+        begin, used = time.perf_counter(), time.process_time()
         points, state = ask(settings, state)
-        asked = time.perf_counter()
+        elapsed, spent = time.perf_counter() - begin, time.process_time() - used
         costs = function(points)
-        resumed = time.perf_counter()
+        begin, used = time.perf_counter(), time.process_time()
         state, _ = tell(settings, state, points, costs)
-        times.append(1e3 * (asked - begin + time.perf_counter() - resumed))
-    return float(np.median(times)), float(np.percentile(times, 95))
+        wall.append(1e3 * (elapsed + time.perf_counter() - begin))
+        processor += 1e3 * (spent + time.process_time() - used)
+    return float(np.median(wall)), float(np.percentile(wall, 95)), processor / generations
 
 
 def machine() -> str:
@@ -215,8 +219,10 @@ def main() -> int:
                 figures = "".join(f"{medians[name]:13.3g}" for name in RUNNERS)
                 verdict = "pass" if share <= 1 else "FAIL"
                 print(f"{kind:18s}{place:11s}{dimension:3d}{figures}{share:8.1g}  {verdict}", flush=True)
-    median, high = time_update()
-    print(f"\nask + tell at n = 84: median {median:.2f} ms, 95th percentile {high:.2f} ms")
+    median, high, processor = time_update()
+    print(
+        f"\nask + tell at n = 84: wall median {median:.2f} ms, 95th percentile {high:.2f} ms; processor {processor:.2f} ms"
+    )
     return 0 if passed else 1
 
 
