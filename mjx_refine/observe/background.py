@@ -8,8 +8,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy import ndimage, sparse
+from scipy import sparse
 from scipy.sparse import csgraph
+
+from mjx_refine.observe.untyped import ndimage, opencv
 
 _CHUNKS = 10
 _SEAM_GAIN = 0.85  # the rarer state must make a seam this much fainter than the commoner one to be the background
@@ -99,7 +101,7 @@ def find_motion(frames: UInt8[np.ndarray, "frames height width 3"]) -> Bool[np.n
     scale = min(1.0, 200 / width)
     size = (max(32, round(width * scale)), max(24, round(height * scale)))
     greys = [cv2.cvtColor(cv2.resize(f, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY) for f in frames]
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    dis = opencv.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
     moving = np.zeros((len(frames), size[1], size[0]), bool)
     for k, (first, second) in enumerate(itertools.pairwise(greys)):
         even = np.clip(second * (np.median(first + 1.0) / np.median(second + 1.0)), 0, 255).astype(np.uint8)

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from mjx_refine.observe.untyped import opencv
+
 _LEAST_POINTS = 15
 
 
@@ -66,8 +68,8 @@ def _step(previous: np.ndarray, current: np.ndarray) -> Float[np.ndarray, "3 3"]
     points = _spread_corners(previous)
     if points is None or len(points) < _LEAST_POINTS:
         return None
-    there, found, _ = cv2.calcOpticalFlowPyrLK(previous, current, points, None, winSize=(21, 21), maxLevel=3)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(current, previous, there, None, winSize=(21, 21), maxLevel=3)
+    there, found, _ = opencv.calcOpticalFlowPyrLK(previous, current, points, None, winSize=(21, 21), maxLevel=3)
+    back, found_back, _ = opencv.calcOpticalFlowPyrLK(current, previous, there, None, winSize=(21, 21), maxLevel=3)
     good: Bool[np.ndarray, " points"] = (found.ravel() > 0) & (found_back.ravel() > 0)
     good &= np.abs(points - back).reshape(-1, 2).max(-1) < 0.5
     if np.count_nonzero(good) < _LEAST_POINTS:

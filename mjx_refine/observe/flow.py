@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy import ndimage
+
+from mjx_refine.observe.untyped import ndimage, opencv
 
 _MARGIN = 12  # px around an object's crop
-_PLAY = 0.4  # px; how far an object's flow is expected to be from its rigid motion in the picture
+_PLAY = 0.2  # px; how far an object's flow is expected to be from its rigid motion in the picture
 _FLOOR = 0.03  # px; DIS is never better
 _CEILING = 8.0  # px
 
@@ -30,9 +32,9 @@ class FlowField:
     background_sigma: float
 
 
-def make_dis(width: int) -> cv2.DISOpticalFlow:
+def make_dis(width: int) -> Any:
     """Dense inverse search (Kroeger et al., ECCV 2016), medium preset, down to full resolution on small crops."""
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dis = opencv.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     if width <= 200:
         dis.setFinestScale(0)
     return dis
@@ -66,7 +68,9 @@ def measure_flow(
             objects = (masks[t] > 0) | (masks[t + 1] > 0)
             for number in np.unique(masks[t][masks[t] > 0]):
                 here, there = masks[t] == number, masks[t + 1] == number
-                _measure_object((greys[t], greys[t + 1]), (here, there), (flow[t], sigma[t], forward))
+                _measure_object(
+                    _contrasting(frames[t], frames[t + 1], here), (here, there), (flow[t], sigma[t], forward)
+                )
         grown = ndimage.binary_dilation(objects, iterations=10)
         spread, smooth = _background_motion(flow[t], ~grown)
         quiet.append(spread)
@@ -113,6 +117,29 @@ def _disagreement(
     return np.hypot(*np.moveaxis(forward + back, -1, 0))
 
 
+def _contrasting(
+    first: UInt8[np.ndarray, "height width 3"],
+    second: UInt8[np.ndarray, "height width 3"],
+    region: Bool[np.ndarray, "height width"],
+) -> tuple[UInt8[np.ndarray, "height width"], UInt8[np.ndarray, "height width"]]:
+    """Grey pictures in which the object stands out: brightness, or the axis of colour in which it differs."""
+    near = ndimage.binary_dilation(region, iterations=2)
+    ring = ndimage.binary_dilation(near, iterations=4) & ~near
+    greys = cv2.cvtColor(first, cv2.COLOR_RGB2GRAY), cv2.cvtColor(second, cv2.COLOR_RGB2GRAY)
+    if not ring.any():
+        return greys
+    inside, outside = first[region].mean(0), first[ring].mean(0)
+    contrast = inside - outside
+    length = float(np.linalg.norm(contrast))
+    if abs(float(greys[0][region].mean()) - float(greys[0][ring].mean())) > 0.5 * length or length < 10:
+        return greys
+    axis, middle = contrast / length, 0.5 * (inside + outside)
+    one, other = (
+        np.clip(np.rint(128 + (f.astype(np.float32) - middle) @ axis), 0, 255).astype(np.uint8) for f in (first, second)
+    )
+    return one, other
+
+
 def _measure_object(
     greys: tuple[UInt8[np.ndarray, "height width"], UInt8[np.ndarray, "height width"]],
     regions: tuple[Bool[np.ndarray, "height width"], Bool[np.ndarray, "height width"]],
@@ -132,14 +159,15 @@ def _measure_object(
     second = _on_plain(greys[1], there)[window]
     corner = np.array([window[1].start, window[0].start], np.float32)
     pixels = _pixels(window)
-    shift = _subpixel_shift(first, _sample(second, _moved(motion, pixels) - corner), here[window])
+    shift = _subpixel_shift(
+        np.ascontiguousarray(greys[0][window]), _sample(greys[1], _moved(motion, pixels)), here[window]
+    )
     motion[:, 2] += motion[:, :2] @ shift
     aligned = _sample(second, _moved(motion, pixels) - corner)
     rest, error = _small_flow(first, aligned)
     aperture = _texture_sigma(greys[0], here)[window]
     # Where the object shows no texture it moves as a whole.
-    whole = np.median(rest[here[window]], axis=0)
-    rest = whole + (rest - whole) * (_PLAY**2 / (_PLAY**2 + np.square(aperture)))[..., None]
+    rest *= (_PLAY**2 / (_PLAY**2 + np.square(aperture)))[..., None]
     guided = _moved(motion, pixels + rest) - pixels
     inside = here[window]
     landed = _lands(guided, there, window)
@@ -169,7 +197,7 @@ def _moved(motion: Float[np.ndarray, "2 3"], points: Float[np.ndarray, "h w 2"])
 
 def _sample(image: np.ndarray, points: Float[np.ndarray, "h w 2"]) -> np.ndarray:
     """The image at (column, row) points, bilinear."""
-    return cv2.remap(
+    return opencv.remap(
         image, np.ascontiguousarray(points, np.float32), None, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE
     )
 

@@ -8,9 +8,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy import ndimage
 
 from mjx_refine.observe.background import brightness_gain
+from mjx_refine.observe.untyped import ndimage
 
 _SQUARE = np.ones((3, 3), bool)
 _CROSS = ndimage.generate_binary_structure(2, 1)
@@ -191,7 +191,7 @@ def refine_outline(
     are thereby halved rather than swallowed.
     """
     even, background, noise = change.even[window], change.background[window], change.noise[window]
-    area = np.count_nonzero(region)
+    area = int(np.count_nonzero(region))
     if area == 0:
         return region
     difference = even - background
@@ -307,7 +307,7 @@ def convex_hull(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 def convex_fill(region: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Fills the notches of a nearly convex region: spheres, boxes and cylinders look convex from everywhere."""
-    area = np.count_nonzero(region)
+    area = int(np.count_nonzero(region))
     if area < 12:
         return region
     hull = convex_hull(region)

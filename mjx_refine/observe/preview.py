@@ -71,7 +71,8 @@ def _frame_tile(observation: Observation, t: int, scale: float) -> UInt8[np.ndar
     image = cv2.resize(image, size, interpolation=cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA)
     if observation.masks is not None:
         for number in (n for n in np.unique(observation.masks[t]) if n):
-            colour = tuple(int(c) for c in _COLOURS[(number - 1) % len(_COLOURS)])
+            red, green, blue = (int(c) for c in _COLOURS[(number - 1) % len(_COLOURS)])
+            colour = red, green, blue
             mask = (observation.masks[t] == number).astype(np.uint8)
             mask = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
             contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy import ndimage
 
 from mjx_refine.observe.foreground import Blob
 from mjx_refine.observe.tracking import Track
+from mjx_refine.observe.untyped import ndimage
 
 _ON_THE_SPOT = "changing on the spot without moving, like a reflection, a clock or flicker"
 

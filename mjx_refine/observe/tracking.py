@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from mjx_refine.observe.foreground import Blob, Change, make_blob
+from mjx_refine.observe.untyped import ndimage
 
 _PATIENCE = 6  # frames that a track waits for its object to come back
 _WORST_COST = 2.2

@@ -111,7 +111,7 @@ def test_two_discs_and_a_box_are_masked_tightly_with_stable_ids_and_their_flow(t
         inside = (result.observation.masks[5] == number) & truth[k, 5]
         flow = np.nanmedian(result.observation.flow[5][inside], axis=0)
         step = bodies[k][1][6] - bodies[k][1][5]
-        np.testing.assert_allclose(flow, step, atol=0.35)
+        np.testing.assert_allclose(flow, step, atol=0.5)  # bodies without texture
     still = ~truth.any((0, 1))
     assert np.nanmedian(np.abs(result.observation.flow[:, still])) < 0.1
 
@@ -152,16 +152,15 @@ def test_flow_noise_covers_the_errors_on_a_turning_textured_disc(tmp_path):
     assert np.isfinite(error).mean() > 0.98
     assert np.nanmedian(np.abs(error)) < 0.25
     normal = np.nanmedian(np.abs(error)) / (0.6745 * np.median(sigma))
-    print(np.nanmedian(np.abs(error)), np.median(sigma))
     assert 0.2 < normal < 2.5
 
 
 def test_object_that_stops_stays_masked_and_one_that_rests_at_first_is_masked_from_the_start(tmp_path):
-    frames = 40
-    stops = line((25, 40), (6, 0), frames)
-    stops[14:] = stops[14]
-    starts = line((60, 110), (5, 0), frames)
-    starts = np.concatenate([np.repeat(starts[:1], 24, axis=0), starts[: frames - 24]])
+    frames = 30
+    stops = line((25, 40), (8, 0), frames)
+    stops[11:] = stops[11]
+    starts = line((60, 110), (7, 0), frames)
+    starts = np.concatenate([np.repeat(starts[:1], 17, axis=0), starts[: frames - 17]])
     bodies = [("disc", stops, 12.0, (230, 220, 40)), ("box", starts, 10.0, (40, 60, 220))]
     truth = clip_of(tmp_path / "clip.avi", bodies, textured(5))
     result = observe_clip(tmp_path / "clip.avi")
@@ -373,6 +372,6 @@ def test_bad_mask_directories_are_named(simple, tmp_path):
 
 
 def test_same_clip_gives_the_same_observation(simple):
-    first, second = observe_clip(simple[0]), observe_clip(simple[0])
+    first, second = (observe_clip(simple[0], end=0.4, size="100x75") for _ in range(2))
     np.testing.assert_array_equal(first.observation.masks, second.observation.masks)
     np.testing.assert_array_equal(first.observation.flow, second.observation.flow)
