@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import logging
 import os
 import time
@@ -46,11 +47,9 @@ def enable_cache() -> Path | None:
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-    try:
-        import warp
-    except ImportError:
-        return folder
-    warp.config.kernel_cache_dir = str(folder / "warp")
+    if importlib.util.find_spec("warp") is not None:
+        warp = importlib.import_module("warp")
+        warp.config.kernel_cache_dir = str(folder / "warp")
     return folder
 
 

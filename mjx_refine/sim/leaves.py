@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.scene import Shape
+from mjx_refine.sim.mjx_import import mjx
 from mjx_refine.sim.model import model_fields
 
 
@@ -42,7 +42,7 @@ def candidate_model(base: mjx.Model, leaves: Leaves, shapes: tuple[Shape, ...]) 
         return jnp.concatenate([old[:1], new.astype(old.dtype)])
 
     mass = leaves.body_mass
-    return base.tree_replace(
+    changed = base.tree_replace(
         {
             "geom_size": keep_first(base.geom_size, leaves.geom_size),
             "geom_rbound": keep_first(base.geom_rbound, leaves.geom_rbound),
@@ -58,6 +58,7 @@ def candidate_model(base: mjx.Model, leaves: Leaves, shapes: tuple[Shape, ...]) 
             "opt.gravity": leaves.gravity,
         }
     )
+    return cast(mjx.Model, changed)
 
 
 def _boxes(old: jax.Array, size: jax.Array, shapes: tuple[Shape, ...]) -> jax.Array:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.compile_cache import compiling
 from mjx_refine.scene import Shape
 from mjx_refine.sim.colliders import installed
 from mjx_refine.sim.leaves import Leaves, candidate_model, leaves_of
+from mjx_refine.sim.mjx_import import mjx
 from mjx_refine.sim.model import SUBSTEPS, build_spec, initial_state
 
 BUCKETS = (1, 4, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192)
@@ -54,6 +56,8 @@ class MjxSimulator:
         self.fps = fps
         self.device = jax.devices()[0].platform
         model = build_spec(shapes, fps).compile()
+        # Single precision cannot reach the default of 1e-8: the solver would iterate on rounding noise, in flight too.
+        model.opt.tolerance = 1e-6
         model.opt.iterations = iterations
         model.opt.ls_iterations = ls_iterations
         with installed():
@@ -93,9 +97,21 @@ class MjxSimulator:
         size = len(arguments[1])
         if (size, frames) not in self._programs:
             with compiling(f"MJX-JAX physics of {'+'.join(self.shapes)}, {size} candidates, {frames} frames"):
-                program = jax.jit(jax.vmap(lambda *one: self.trajectory(*one, frames)))
+                program = jax.jit(jax.vmap(functools.partial(self.trajectory, frames=frames)))
                 self._programs[size, frames] = program.lower(*arguments).compile()
         return self._programs[size, frames]
+
+    def contact_distances(self, batch: SceneBatch) -> Float[np.ndarray, "batch contacts"]:
+        """Distance of every possible contact in the first frame [m]; positive where there is none."""
+
+        def one(leaves: Leaves, qpos: jax.Array) -> jax.Array:
+            data = mjx.kinematics(candidate_model(self._model, leaves, self.shapes), self._data.replace(qpos=qpos))
+            with installed():
+                data = mjx.collision(candidate_model(self._model, leaves, self.shapes), data)
+            return data._impl.contact.dist
+
+        qpos, _ = initial_state(batch)
+        return np.asarray(jax.jit(jax.vmap(one))(leaves_of(batch), jnp.asarray(qpos)), np.float64)
 
     def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
         """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged."""

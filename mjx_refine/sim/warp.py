@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.compile_cache import compiling
@@ -16,9 +17,13 @@ from mjx_refine.errors import InputError
 from mjx_refine.scene import Shape
 from mjx_refine.sim.leaves import Leaves, candidate_model, leaves_of
 from mjx_refine.sim.mjx import diverged_to_nan, padded
+from mjx_refine.sim.mjx_import import mjx
 from mjx_refine.sim.model import SUBSTEPS, build_spec, contact_pairs, initial_state
 
 REMEDY = "pip install 'mjx-refine[warp]' on a machine with an NVIDIA GPU, or choose --backend mujoco"
+
+_ITERATION_WARNINGS = (1 << 9) | (1 << 10)
+"""Warp's ``OverflowType.ITERATIONS`` and ``LS_ITERATIONS``."""
 
 _POINTS = {("floor", "sphere"): 1, ("floor", "box"): 8, ("floor", "cylinder"): 4}
 
@@ -63,8 +68,8 @@ class WarpSimulator:
         self,
         shapes: tuple[Shape, ...],
         fps: float,
-        iterations: int = 20,
-        ls_iterations: int = 20,
+        iterations: int = 50,
+        ls_iterations: int = 50,
         any_device: bool = False,
     ):
         problem = warp_problem()
@@ -76,7 +81,10 @@ class WarpSimulator:
         self._mujoco = build_spec(shapes, fps).compile()
         self._mujoco.opt.iterations = iterations
         self._mujoco.opt.ls_iterations = ls_iterations
-        self._model = mjx.put_model(self._mujoco, impl="warp")
+        model = mjx.put_model(self._mujoco, impl="warp")
+        # Too few iterations in some step are no news (the solver went as far as it may); too few contacts would be.
+        silent = model.opt._impl.warn_overflow & ~_ITERATION_WARNINGS
+        self._model = cast(mjx.Model, model.tree_replace({"opt._impl.warn_overflow": silent}))
         self._programs: dict[tuple[int, int], jax.stages.Compiled] = {}
 
     def _data(self, size: int) -> mjx.Data:
@@ -106,7 +114,7 @@ class WarpSimulator:
         if (size, frames) not in self._programs:
             with compiling(f"MJX-Warp physics of {'+'.join(self.shapes)}, {size} candidates, {frames} frames"):
                 data = self._data(size)
-                program = jax.jit(jax.vmap(lambda *one: self._trajectory(data, *one, frames)))
+                program = jax.jit(jax.vmap(functools.partial(self._trajectory, data, frames=frames)))
                 self._programs[size, frames] = program.lower(*arguments).compile()
         return self._programs[size, frames]
 

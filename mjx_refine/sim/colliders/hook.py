@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import threading
 from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from mujoco.mjx._src import collision_driver
-from mujoco.mjx._src.types import GeomType
 
 from mjx_refine.errors import InputError
+from mjx_refine.sim.mjx_import import mjx
 
 Geom = tuple[Float[Array, "3"], Float[Array, "3 3"], Float[Array, "3"]]
 """Position [m], rotation (columns are the geom's axes in the world) and ``geom_size`` [m]."""
 
 Points = tuple[Float[Array, " points"], Float[Array, "points 3"], Float[Array, "points 3"]]
 """Distance (positive: no contact), position and normal from the first geom to the second, of every contact point."""
+
+collision_driver = importlib.import_module(f"{mjx.__name__}._src.collision_driver")
+solver = importlib.import_module(f"{mjx.__name__}._src.solver")
+GeomType = mjx.GeomType
 
 _lock = threading.RLock()
 
@@ -65,17 +69,39 @@ def _table() -> dict:
     return table
 
 
+class _SafeNumpy:
+    """``jax.numpy`` whose square root has derivative zero at zero.
+
+    MJX's line search takes the root of the slip of every possible contact, which is exactly zero where there is none:
+    the infinite derivative times zero makes every forward-mode derivative NaN.
+    """
+
+    def __getattr__(self, name: str):
+        return getattr(jnp, name)
+
+    @staticmethod
+    def sqrt(x: jax.Array) -> jax.Array:
+        zero = x == 0
+        return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, x)))
+
+
 @contextlib.contextmanager
 def installed() -> Iterator[None]:
-    """While it lasts, MJX finds our colliders; wrap what builds models and data, and what traces a step."""
+    """While it lasts, MJX finds our colliders, and its solver has forward-mode derivatives without NaN.
+
+    Wrap what builds models and data, and what traces a step.
+    """
     from mjx_refine.sim.colliders.table import COLLIDERS
 
     with _lock:
         table = _table()
         before = dict(table)
         table.update(COLLIDERS)
+        numpy = solver.jp
+        solver.jp = _SafeNumpy()
         try:
             yield
         finally:
+            solver.jp = numpy
             table.clear()
             table.update(before)

@@ -1,0 +1,17 @@
+"""Imports MJX without what it and Warp print on standard output, where a command's results belong."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import io
+
+if importlib.util.find_spec("warp") is not None:
+    warp = importlib.import_module("warp")
+    warp.config.log_level = warp.LOG_WARNING
+
+with contextlib.redirect_stdout(io.StringIO()):
+    from mujoco import mjx
+
+__all__ = ["mjx"]
