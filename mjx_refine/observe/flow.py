@@ -324,7 +324,9 @@ def _texture_sigma(
     gy = cv2.Scharr(patch, cv2.CV_32F, 0, 1, scale=1 / 32) * inner
     xx, yy, xy = (9 * 9 * cv2.blur(g, (9, 9)) for g in (gx * gx, gy * gy, gx * gy))
     weaker = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)
-    noise, smoothing = 2.0, 1.0  # levels; and pixels over which neighbouring residuals hang together
+    noise = 2.0  # levels
+    # Noise alone has gradients too: Scharr's kernel passes a fifth of its variance, 81 pixels add up.
+    signal = weaker - 81 * 0.2 * noise**2
     sigma = np.zeros(grey.shape, np.float32)
-    sigma[window] = np.minimum(noise * smoothing / np.sqrt(np.maximum(weaker, 1e-3)), 3.0)
+    sigma[window] = np.minimum(noise / np.sqrt(np.maximum(signal, 1e-3)), 3.0)
     return sigma
