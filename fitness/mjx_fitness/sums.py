@@ -86,6 +86,11 @@ class Scores:
     fitness: Float[np.ndarray, "batch"]
 
 
+    def candidate(self, row: int) -> Scores:
+        """The scores of one candidate, as a batch of one."""
+        return Scores(**{f.name: getattr(self, f.name)[row : row + 1] for f in dataclasses.fields(self)})
+
+
 def _ratio(numerator: np.ndarray, denominator: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(denominator > 0, numerator / np.where(denominator > 0, denominator, 1), np.nan)

@@ -48,21 +48,27 @@ def outlines(masks: Int[np.ndarray, "frames height width"], count: int = DIRECTI
 
 
 def _measure(frame: np.ndarray, i: int, normals: np.ndarray):
-    rows, columns = np.nonzero(frame == i)
-    if len(rows) == 0:
-        return None
-    centre = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
-    if len(rows) < MIN_PIXELS:
-        return len(rows), centre, np.full(len(normals), np.nan)
+    """(area, centroid, support) of one mask in one frame, or None where it is absent."""
     height, width = frame.shape
-    rim = ndimage.binary_erosion(frame == i, border_value=0)
-    rows, columns = np.nonzero((frame == i) & ~rim)
-    points = np.stack([columns + 0.5, rows + 0.5], -1)
-    along = points @ normals.T
+    inside_rows = np.nonzero((frame == i).any(1))[0]
+    if len(inside_rows) == 0:
+        return None
+    # Only the mask's surroundings are looked at: two pixels beyond its box.
+    inside_columns = np.nonzero((frame[inside_rows[0] : inside_rows[-1] + 1] == i).any(0))[0]
+    top, left = max(inside_rows[0] - 2, 0), max(inside_columns[0] - 2, 0)
+    part = frame[top : inside_rows[-1] + 3, left : inside_columns[-1] + 3]
+    mask = part == i
+    area = int(np.count_nonzero(mask))
+    rows, columns = np.nonzero(mask)
+    centre = np.array([columns.mean() + left + 0.5, rows.mean() + top + 0.5])
+    if area < MIN_PIXELS:
+        return area, centre, np.full(len(normals), np.nan)
+    rows, columns = np.nonzero(mask & ~ndimage.binary_erosion(mask))
+    along = np.stack([columns + left + 0.5, rows + top + 0.5], -1) @ normals.T
     extreme = along.argmax(0)
     # Half a pixel: an edge lies on average that far beyond the last centre inside, across the nearer axis.
     reach = along.max(0) + 0.5 * np.abs(normals).max(-1)
-    others = ndimage.maximum_filter(np.where(frame == i, 0, frame), size=5)
-    rows, columns = rows[extreme], columns[extreme]
-    cut = (rows < 2) | (columns < 2) | (rows >= height - 2) | (columns >= width - 2) | (others[rows, columns] > 0)
-    return int(np.count_nonzero(frame == i)), centre, np.where(cut, np.nan, reach)
+    others = ndimage.maximum_filter(np.where(mask, 0, part), size=5)[rows[extreme], columns[extreme]] > 0
+    rows, columns = rows[extreme] + top, columns[extreme] + left
+    cut = (rows < 2) | (columns < 2) | (rows >= height - 2) | (columns >= width - 2) | others
+    return area, centre, np.where(cut, np.nan, reach)

@@ -16,6 +16,9 @@ from mjx_refine.view.frames import camera_matrix, rotation_matrix
 RIM = 32
 """Points on a circle; its polygon falls short of it by at most 0.5 % of the radius."""
 
+BATCHES = (8, 32, 128)
+"""Batch sizes that are compiled; larger batches are multiples of the last."""
+
 NEAR = 0.02
 """Depth [m] to which points behind the camera are moved."""
 
@@ -93,5 +96,8 @@ def supports(
     Occlusion and the image's border do not matter to it.
     """
     arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
-    device = [jnp.asarray(a, jnp.float32) for a in arrays]
-    return np.asarray(_supports(batch.shapes, *device, count, *image))
+    # Few sizes are ever compiled: a search asks for batches of many lengths.
+    size = next((b for b in BATCHES if b >= len(poses)), -(-len(poses) // BATCHES[-1]) * BATCHES[-1])
+    padded = [np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]) for a in map(np.asarray, arrays)]
+    device = [jnp.asarray(a, jnp.float32) for a in padded]
+    return np.asarray(_supports(batch.shapes, *device, count, *image))[: len(poses)]

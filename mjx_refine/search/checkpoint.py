@@ -1,0 +1,57 @@
+"""The state of a run on disk: written whole after every step, read back bit for bit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_refine import files
+from mjx_refine.errors import InputError
+
+VERSION = 1
+
+
+def digest(*parts: object) -> str:
+    """A fingerprint of a run's input: arrays by their bytes, everything else by its text."""
+    state = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            state.update(f"{part.dtype}{part.shape}".encode())
+            state.update(np.ascontiguousarray(part).tobytes())
+        else:
+            state.update(repr(part).encode())
+        state.update(b"\0")
+    return state.hexdigest()
+
+
+def save_checkpoint(path: Path, values: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+    """Writes ``values`` (as JSON) and ``arrays``, whole or not at all."""
+    text = np.frombuffer(json.dumps({"version": VERSION, **values}).encode(), np.uint8)
+    files.write_atomic(path, lambda stream: np.savez(stream, **{"__values__": text}, **arrays))
+
+
+def load_checkpoint(path: Path, expected: str) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
+    """Reads a checkpoint back; None where there is none yet.
+
+    Raises:
+      InputError: it is damaged, or belongs to another input or other options.
+    """
+    if not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+        values = json.loads(arrays.pop("__values__").tobytes())
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: not a readable checkpoint ({error}); run again without --resume") from error
+    if values.get("version") != VERSION or values.get("digest") != expected:
+        raise InputError(
+            f"{path}: made for another input or other options; expected those of this call; "
+            "repeat the first call's arguments, or run without --resume"
+        )
+    return values, arrays

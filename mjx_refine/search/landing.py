@@ -1,0 +1,271 @@
+"""Landing: least squares on outlines takes a rough scene to where a population search can finish.
+
+Levenberg-Marquardt (Marquardt 1963) on the maximum a posteriori problem: residuals are how far each silhouette reaches
+in 16 directions, beside what the masks show [px], and the distance from the start in prior widths. Derivatives are
+finite differences over rollouts, a whole Jacobian and a whole line search being one batch each. The horizon grows from
+the first frame to the last: an early collision must be right before what follows it means anything.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.search.features import DIRECTIONS, Outlines
+from mjx_refine.space import Space
+from mjx_refine.view.outline import supports
+
+DAMPINGS = np.array([1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0])
+"""Multiples of the prior's curvature that one line search tries."""
+
+HOPS = 2
+"""Attempts at each horizon to find a better basin for objects that do not fit."""
+
+SCATTER = 256
+"""Points that one attempt draws."""
+
+MISFIT = 1.5
+"""Root mean square distance of outlines [px at a picture 480 wide] above which an object is said not to fit."""
+
+TURNS = ("yaw", "tilt", "lean")
+"""Fields of the parameter space that turn an object at the start."""
+
+NOISE_FLOOR = 0.5
+"""Standard deviation of a mask's edge [px at a picture 480 wide]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """Frames that count, scale of the robust loss [px at a picture 480 wide], most iterations."""
+
+    frames: int
+    scale: float
+    iterations: int
+
+
+HORIZONS = (0.1, 0.17, 0.24, 0.32, 0.41, 0.5, 0.6, 0.72, 0.86, 1.0)
+"""Parts of the clip, one after the other; small steps at first, while there is little to go by."""
+
+
+def stages(length: int) -> list[Stage]:
+    """The horizon from the first frame to the whole clip, the loss from forgiving to strict."""
+    horizons = sorted({1, *[min(length, max(2, round(length * part))) for part in HORIZONS]})
+    result = [Stage(h, 12.0 if h < length else 6.0, 3 if h < length else 8) for h in horizons]
+    return [*result, Stage(length, 2.0, 8)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Landing:
+    """Where least squares arrived.
+
+    Attributes:
+      point: in the unit box.
+      cost: half the sum of squares at the last stage.
+      covariance: inverse curvature of that cost, the prior included, in the unit box.
+      sensitivity: change of the residual vector [noise widths] for one prior width of each parameter, without the prior.
+      evaluations: rollouts it took, in units of the whole clip.
+    """
+
+    point: Float[np.ndarray, "dimension"]
+    cost: float
+    covariance: Float[np.ndarray, "dimension dimension"]
+    sensitivity: Float[np.ndarray, "dimension"]
+    evaluations: int
+
+
+class LeastSquares:
+    """The residuals of points in the unit box, and Levenberg-Marquardt on them.
+
+    Args:
+      space: the parameters.
+      rollout: poses of a batch for a number of frames.
+      seen: the observed outlines.
+      columns: for each object the column of ``seen`` that belongs to it, or -1.
+      image: (width, height) [px].
+      limit: rollouts that may be spent.
+      seed: of the points tried when the horizon grows.
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        rollout: Callable[[SceneBatch, int], np.ndarray],
+        seen: Outlines,
+        columns: tuple[int, ...],
+        image: tuple[int, int],
+        limit: int = 10**9,
+        seed: int = 0,
+    ):
+        self.limit, self.seed = limit, seed
+        self.space, self.rollout, self.image = space, rollout, image
+        self.pixel = image[0] / 480.0
+        target = np.full((len(seen.support), len(columns), DIRECTIONS), np.nan)
+        for n, j in enumerate(columns):
+            if j >= 0:
+                target[:, n] = seen.support[:, j]
+        self.target = target
+        self.spent = 0.0
+
+    def _distances(self, points: np.ndarray, frames: int) -> tuple[np.ndarray, np.ndarray]:
+        """(simulated minus observed reach (B, frames, N, directions) [px at 480 wide], whether a candidate diverged)."""
+        batch = self.space.decode(points)
+        poses = self.rollout(batch, frames)
+        self.spent += len(points) * frames / len(self.target)
+        bad = ~np.isfinite(poses).all((1, 2, 3))
+        poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
+        # The outlines of all frames, so that one length is compiled; those beyond the horizon repeat its last.
+        beyond = np.repeat(poses[:, -1:], len(self.target) - frames, axis=1)
+        reach = supports(np.concatenate([poses, beyond], 1), batch, self.image, DIRECTIONS)[:, :frames]
+        return (reach - self.target[:frames]) / self.pixel, bad
+
+    def _robust(self, raw: np.ndarray, scale: float) -> np.ndarray:
+        """Residuals in noise widths whose growth slows beyond ``scale`` but never ends: a pull at any distance.
+
+        Edges of one mask are not independent: its directions together count as six.
+        """
+        slowed = np.sign(raw) * scale * np.sqrt(np.log1p((raw / scale) ** 2))
+        return slowed * (np.sqrt(6 / DIRECTIONS) / NOISE_FLOOR)
+
+    def residuals(self, points: np.ndarray, frames: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
+        """(robust residuals (B, R), their half sum of squares with the prior (B,))."""
+        raw, bad = self._distances(points, frames)
+        robust = self._robust(np.nan_to_num(raw.reshape(len(points), -1)), scale)
+        prior = (points - self.space.start) / self.space.sigma
+        cost = 0.5 * (robust**2).sum(-1) + 0.5 * (prior**2).sum(-1)
+        return robust, np.where(bad, np.inf, cost)
+
+    def jacobian(self, point: np.ndarray, base: np.ndarray, frames: int, scale: float) -> np.ndarray:
+        """d residuals / d (prior widths) by finite differences, towards the inside of the box, (R, D)."""
+        step = 0.05 * self.space.sigma
+        sign = np.where(point + step > 1.0, -1.0, 1.0)
+        points = point + np.diag(sign * step)
+        moved, _ = self.residuals(np.clip(points, 0.0, 1.0), frames, scale)
+        return ((moved - base) / (sign[:, None] * 0.05)).T
+
+    @property
+    def evaluations(self) -> int:
+        """Rollouts so far, in units of the whole clip: one of half its frames counts half."""
+        return int(np.ceil(self.spent))
+
+    @property
+    def _spent(self) -> bool:
+        """Whether another Jacobian and line search would exceed the limit."""
+        return self.evaluations + self.space.dimension + 2 * len(DAMPINGS) > self.limit
+
+    def run(self, start: np.ndarray, schedule: list[Stage], progress: Callable[[Stage, np.ndarray], None] | None = None) -> Landing:
+        """Goes through the stages from ``start``."""
+        before = self.evaluations
+        generator = np.random.default_rng(self.seed)
+        point, jacobian, cost = start, np.zeros((0, len(start))), np.inf
+        for stage in schedule:
+            if self._spent:
+                break
+            if stage.frames > 1 and len(jacobian):
+                point, cost, jacobian = self._extend(point, jacobian, stage, generator)
+            else:
+                point, cost, jacobian = self._stage(point, stage)
+            if progress:
+                progress(stage, point)
+        curvature = jacobian.T @ jacobian + np.eye(len(start))
+        scale = self.space.sigma
+        return Landing(
+            point=point,
+            cost=cost,
+            covariance=np.linalg.inv(curvature) * np.outer(scale, scale),
+            sensitivity=np.linalg.norm(jacobian, axis=0),
+            evaluations=self.evaluations - before,
+        )
+
+    def _extend(self, point, jacobian, stage: Stage, generator):
+        """Least squares at a longer horizon, from several points that the shorter one leaves open.
+
+        A single picture does not tell how far away, hence how large, an object in the air is, nor what the next contact
+        will do; derivatives end there. Objects that have not met move independently, and a rollout of all tells the cost
+        of each: the best draw of every object that does not fit is combined into one point.
+        """
+        best = self._stage(point, stage)
+        for _ in range(HOPS):
+            misfit = self._misfit(best[0], stage)
+            if not misfit.any() or self._spent:
+                break
+            combined = self._combined(point, best[0], jacobian, misfit, stage, generator)
+            hop = self._stage(combined, stage)
+            if hop[1] < best[1]:
+                best = hop
+        return best
+
+    def _misfit(self, point: np.ndarray, stage: Stage) -> np.ndarray:
+        raw = self._distances(point[None], stage.frames)[0][0]
+        seen = np.isfinite(raw).sum((0, 2))
+        return np.sqrt(np.nansum(raw**2, (0, 2)) / np.maximum(seen, 1)) > MISFIT
+
+    def _combined(self, before, now, jacobian, misfit: np.ndarray, stage: Stage, generator) -> np.ndarray:
+        """``now``, with the misfitting objects' parameters from the best of many draws around ``before``."""
+        owner = np.array([p.index[0] for p in self.space.parameters])
+        points = self._draws(before, jacobian, generator)
+        keep = ~np.isin(owner, np.nonzero(misfit)[0])
+        points[:, keep] = now[keep]
+        raw, bad = self._distances(points, stage.frames)
+        prices = np.nansum(0.5 * self._robust(raw, stage.scale) ** 2, (1, 3)) + np.where(bad, 1e12, 0.0)[:, None]
+        combined = now.copy()
+        for n in np.nonzero(misfit)[0]:
+            combined[owner == n] = points[int(np.argmin(prices[:, n]))][owner == n]
+        return combined
+
+    def _draws(self, point, jacobian, generator) -> np.ndarray:
+        """Points around ``point``: half from what its horizon leaves open (the posterior of least squares), half from
+        the prior, with any orientation where an object is in the air."""
+        count, size = SCATTER // 2, len(point)
+        factor = np.linalg.inv(np.linalg.cholesky(jacobian.T @ jacobian + np.eye(size)))
+        near = (generator.standard_normal((count, size)) @ factor) * np.geomspace(0.3, 3.0, count)[:, None]
+        far = generator.standard_normal((count, size)) * np.geomspace(0.1, 1.0, count)[:, None]
+        for j, parameter in enumerate(self.space.parameters):
+            if parameter.field in TURNS and parameter.width > 0.1:
+                far[:, j] = generator.uniform(-1.0, 1.0, count) * min(1.6, parameter.high) / parameter.width
+        return np.clip(point + np.concatenate([near, far]) * self.space.sigma, 0.0, 1.0)
+
+    def _stage(self, point: np.ndarray, stage: Stage) -> tuple[np.ndarray, float, np.ndarray]:
+        sigma, start = self.space.sigma, self.space.start
+        damping = 1.0
+        base, costs = self.residuals(point[None], stage.frames, stage.scale)
+        base, cost = base[0], float(costs[0])
+        if self._spent:
+            return point, cost, np.zeros((0, len(point)))
+        jacobian = self.jacobian(point, base, stage.frames, stage.scale)
+        for _ in range(stage.iterations):
+            if self._spent:
+                break
+            gradient = jacobian.T @ base + (point - start) / sigma
+            curvature = jacobian.T @ jacobian + np.eye(len(point))
+            trials = []
+            for factor in DAMPINGS * damping:
+                step = self._bounded_step(point, gradient, curvature, factor)
+                trials.append(np.clip(point + step * sigma, 0.0, 1.0))
+            moved, costs = self.residuals(np.array(trials), stage.frames, stage.scale)
+            best = int(np.argmin(costs))
+            if not costs[best] < cost:
+                if damping > 1e4:
+                    break
+                damping *= 1e3
+                continue
+            gain = cost - float(costs[best])
+            point, base, cost = trials[best], moved[best], float(costs[best])
+            damping = float(np.clip(damping * DAMPINGS[best] / DAMPINGS[2], 1e-3, 1e3))
+            jacobian = self.jacobian(point, base, stage.frames, stage.scale)
+            if gain < 1e-3 * cost:
+                break
+        return point, cost, jacobian
+
+    def _bounded_step(self, point, gradient, curvature, factor) -> np.ndarray:
+        """The damped step [prior widths] with coordinates at a bound that push outwards held there."""
+        free = ~(((point <= 0.0) & (gradient > 0)) | ((point >= 1.0) & (gradient < 0)))
+        step = np.zeros(len(point))
+        matrix = curvature[np.ix_(free, free)]
+        matrix = matrix + factor * np.diag(np.maximum(np.diag(matrix) * 0.01, 1.0))
+        step[free] = -np.linalg.solve(matrix, gradient[free])
+        length = np.abs(step).max(initial=0.0)
+        return step * min(1.0, 3.0 / max(length, 1e-12))

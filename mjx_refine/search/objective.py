@@ -1,0 +1,40 @@
+"""What the population search minimises: minus the fitness of a candidate's pictures, beside a price for overlaps."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from mjx_fitness import Scores
+
+from mjx_refine.sim.backends import Simulator
+from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.space import Space
+from mjx_refine.view.tiles import TileScorer
+
+OVERLAP_ALLOWED = 0.002
+"""Overlap of two objects in the first frame that costs nothing [m]: contacts at rest sink in by as much."""
+
+OVERLAP_PRICE = 20.0
+"""Fitness that a metre of overlap beyond that costs: MuJoCo throws overlapping objects apart."""
+
+
+class Objective:
+    """Costs of points in the unit box.
+
+    Args:
+      space: the parameters.
+      simulator: the backend that searches.
+      reference: C MuJoCo, for the overlaps at the start.
+      scorer: of pictures.
+    """
+
+    def __init__(self, space: Space, simulator: Simulator, reference: MujocoSimulator, scorer: TileScorer):
+        self.space, self.simulator, self.reference, self.scorer = space, simulator, reference, scorer
+
+    def __call__(self, points: Float[np.ndarray, "batch dimension"]) -> tuple[Float[np.ndarray, "batch"], Scores]:
+        """(costs, scores); the cost of a candidate that diverges is inf."""
+        batch = self.space.decode(points)
+        poses = self.simulator.rollout(batch, self.scorer.length)
+        scores = self.scorer(poses, batch)
+        excess = np.maximum(self.reference.overlap(batch) - OVERLAP_ALLOWED, 0.0)
+        return -scores.fitness + OVERLAP_PRICE * excess, scores

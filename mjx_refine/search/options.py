@@ -1,0 +1,60 @@
+"""The choices of a refinement."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from mjx_fitness import Weights
+
+from mjx_refine.errors import InputError
+
+OPTIMIZERS = ("hybrid", "cmaes", "gradient")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """How to refine.
+
+    Attributes:
+      seed: of everything random.
+      population: candidates a generation.
+      iterations: generations; population * iterations is the budget of rollouts, whatever the optimiser spends them on.
+      optimizer: ``cmaes`` searches from the best sample; ``gradient`` is least squares alone (Levenberg-Marquardt on
+        outlines, finite differences); ``hybrid`` lands with least squares and searches from there with the rest.
+      backend: ``mujoco`` (C, all cores), ``mjx``, ``warp``, or ``auto`` for the fastest here.
+      resolution: (width, height) at which the search compares pictures; None: about 160 wide. Reported scores are
+        always at full resolution.
+      weights: of the fitness.
+      starts: samples from which least squares lands, at most.
+      threads: of C MuJoCo; None: all cores.
+    """
+
+    seed: int = 0
+    population: int = 128
+    iterations: int = 100
+    optimizer: str = "hybrid"
+    backend: str = "auto"
+    resolution: tuple[int, int] | None = None
+    weights: Weights = dataclasses.field(default_factory=Weights)
+    starts: int = 3
+    threads: int | None = None
+
+    def __post_init__(self):
+        if self.optimizer not in OPTIMIZERS:
+            raise InputError(f"optimizer = {self.optimizer!r}; expected one of {', '.join(OPTIMIZERS)}")
+        for name, low, high in (
+            ("population", 4, 65536),
+            ("iterations", 1, 10**6),
+            ("starts", 1, 64),
+            ("seed", 0, 2**32 - 1),
+        ):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+                raise InputError(f"{name} = {value!r}; expected a whole number, {low} <= {name} <= {high}")
+        if self.resolution is not None and (len(self.resolution) != 2 or min(self.resolution) < 8):
+            raise InputError(f"resolution = {self.resolution!r}; expected (width, height) of at least 8 x 8")
+
+    @property
+    def budget(self) -> int:
+        """Rollouts in all."""
+        return self.population * self.iterations

@@ -1,0 +1,310 @@
+"""The search itself: land, search, finish; resumable after every step."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+
+import mjx_cmaes
+import numpy as np
+from jaxtyping import Float
+from mjx_fitness import Scores
+
+from mjx_refine.scene import Scene
+from mjx_refine.search.checkpoint import digest, load_checkpoint, save_checkpoint
+from mjx_refine.search.landing import LeastSquares, stages
+from mjx_refine.search.objective import Objective
+from mjx_refine.search.problem import Problem, Start
+from mjx_refine.search.progress import Progress, Step
+from mjx_refine.sim.backends import make_simulator
+from mjx_refine.space import Space
+
+SEARCH_WIDTH = 160
+"""Samples across a picture during the search, by default."""
+
+LANDED_WELL = 0.85
+"""IoU above which no further sample is tried as a start of least squares."""
+
+LANDING_SHARE = 0.5
+"""Part of the budget that least squares may spend before the population search (``hybrid``)."""
+
+INFLATION = 25.0
+"""Factor on the noise variance when the population starts from a landing: pictures and outlines disagree a little."""
+
+ELITES = 8
+"""Candidates of the search that are compared at full resolution in the end."""
+
+CHECKPOINT_SECONDS = 1.0
+
+
+@dataclasses.dataclass
+class Landed:
+    """A start and where least squares took it."""
+
+    rank: int
+    point: np.ndarray
+    covariance: np.ndarray
+    fitness: float
+    iou: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """What the search found: the winning start, its space, the best point and how it was reached."""
+
+    start: Start
+    space: Space
+    scene: Scene
+    scores: Scores
+    history: tuple[Step, ...]
+    evaluations: int
+    reason: str
+    backend: str
+    device: str
+    searched: float
+
+
+class Run:
+    """One refinement.
+
+    Args:
+      problem: samples and observation.
+      progress: a display.
+      checkpoint: file for the state, or None to keep nothing.
+      resume: go on from that file.
+    """
+
+    def __init__(self, problem: Problem, progress: Progress, checkpoint: Path | None, resume: bool):
+        self.problem, self.options, self.progress = problem, problem.options, progress
+        self.path = checkpoint
+        self.began = time.monotonic()
+        observation = problem.observation
+        parts = [observation.flow, observation.fps, problem.samples.scenes, dataclasses.asdict(self.options)]
+        self.digest = digest(*parts, observation.masks if observation.masks is not None else "no masks")
+        self.history: list[Step] = []
+        self.landed: list[Landed] = []
+        self.evaluations = 0
+        self.before = 0.0
+        self._saved: tuple[dict, dict] | None = None
+        self._written = 0.0
+        if resume and checkpoint is not None:
+            self._restore(load_checkpoint(checkpoint, self.digest))
+
+    @property
+    def seconds(self) -> float:
+        """Since the run began, earlier parts of a resumed run included."""
+        return self.before + time.monotonic() - self.began
+
+    @property
+    def resolution(self) -> tuple[int, int]:
+        """(width, height) of the search's samples."""
+        width, height = self.problem.observation.size
+        wanted = self.options.resolution or (SEARCH_WIDTH, round(SEARCH_WIDTH * height / width))
+        return min(width, wanted[0]), min(height, max(wanted[1], 8))
+
+    def __call__(self) -> Found:
+        """Runs to the end."""
+        if self.options.optimizer != "cmaes":
+            self._land()
+        start, space, mean, covariance = self._beginning()
+        reason = "Least squares converged."
+        elites = [mean]
+        simulator_name, device = "mujoco", "cpu"
+        searching = time.monotonic()
+        if self.options.optimizer != "gradient":
+            simulator = make_simulator(self.options.backend, start.scene.shapes, self.problem.observation.fps)
+            simulator_name, device = simulator.name, simulator.device
+            objective = self._objective(start, space, simulator)
+            reason, found = self._search(objective, mean, covariance)
+            elites += found
+        scene, scores = self._finish(start, space, elites)
+        return Found(
+            start=start,
+            space=space,
+            scene=scene,
+            scores=scores,
+            history=tuple(self.history),
+            evaluations=self.evaluations,
+            reason=reason,
+            backend=simulator_name,
+            device=device,
+            searched=time.monotonic() - searching,
+        )
+
+    def _objective(self, start: Start, space: Space, simulator=None) -> Objective:
+        reference = self.problem.reference(start.scene.shapes)
+        scorer = self.problem.scorer(start.scene.shapes, start.matching, self.resolution)
+        return Objective(space, simulator or reference, reference, scorer)
+
+    # Land ---------------------------------------------------------------------------------------------------------
+
+    def _land(self) -> None:
+        share = LANDING_SHARE if self.options.optimizer == "hybrid" else 1.0
+        limit = int(share * self.options.budget)
+        starts = self.problem.starts
+        while len(self.landed) < len(starts):
+            tried = len(self.landed)
+            enough = tried >= self.options.starts
+            if enough and (tried >= 3 * self.options.starts or max(r.iou for r in self.landed) >= LANDED_WELL):
+                break
+            if tried and self.evaluations * (tried + 1) / tried > limit:
+                break
+            self.landed.append(self._land_one(tried, limit - self.evaluations))
+            self._save(force=True)
+
+    def _land_one(self, rank: int, limit: int) -> Landed:
+        start = self.problem.starts[rank]
+        space = Space.around(start.scene)
+        reference = self.problem.reference(start.scene.shapes)
+        columns, image = self.problem.columns(start.matching), self.problem.observation.size
+        squares = LeastSquares(space, reference.rollout, self.problem.seen, columns, image, limit)
+        objective = self._objective(start, space)
+        before = self.evaluations
+
+        def show(stage, point: np.ndarray) -> None:
+            self.evaluations = before + squares.evaluations
+            costs, scores = objective(point[None])
+            self._step("land", -float(costs[0]), scores, float(stage.frames))
+
+        landing = squares.run(space.start, stages(self.problem.observation.length), show)
+        self.evaluations = before + landing.evaluations
+        scores = self.problem.score([space.scene_at(landing.point)], start.matching)
+        curvature = np.linalg.inv(landing.covariance * (1 / np.outer(space.sigma, space.sigma)))
+        loose = (curvature - np.eye(len(curvature))) / INFLATION + np.eye(len(curvature))
+        covariance = np.linalg.inv(loose) * np.outer(space.sigma, space.sigma)
+        return Landed(rank, landing.point, (covariance + covariance.T) / 2, float(scores.fitness[0]), float(scores.iou[0]))
+
+    def _beginning(self) -> tuple[Start, Space, np.ndarray, np.ndarray]:
+        """Where the population search starts: the best landing, or the best sample."""
+        if self.landed:
+            best = max(self.landed, key=lambda landed: landed.fitness)
+            start = self.problem.starts[best.rank]
+            return start, Space.around(start.scene), best.point, best.covariance
+        start = self.problem.starts[0]
+        space = Space.around(start.scene)
+        return start, space, space.start, np.diag(space.sigma**2)
+
+    # Search -------------------------------------------------------------------------------------------------------
+
+    def _search(self, objective: Objective, mean: np.ndarray, covariance: np.ndarray):
+        """Generations until the budget is spent; returns (reason, points for the finish)."""
+        left = self.options.budget - self.evaluations if self._saved is None else 0
+        settings = mjx_cmaes.Settings(dimension=len(mean), population=self.options.population)
+        if self._saved is None:
+            if left < self.options.population:
+                return "The budget of rollouts was spent by least squares.", []
+            state = mjx_cmaes.init(settings, mean, covariance=covariance, seed=self.options.seed)
+            elites, elite_costs = mean[None], np.full(1, np.inf)
+        else:
+            values, arrays = self._saved
+            state = mjx_cmaes.load_state(settings, {k[4:]: v for k, v in arrays.items() if k.startswith("cma.")})
+            elites, elite_costs = arrays["elites"], arrays["elite_costs"]
+        while self.evaluations + self.options.population <= self.options.budget:
+            reason = mjx_cmaes.should_stop(settings, state)
+            if reason is not None:
+                return str(reason), [state.mean, *elites]
+            points, state = mjx_cmaes.ask(settings, state)
+            if state.generation == 0:
+                points = mjx_cmaes.inject(points, np.stack([mean, objective.space.start]))
+            costs, scores = objective(points)
+            state, _ = mjx_cmaes.tell(settings, state, points, costs)
+            self.evaluations += len(points)
+            elites, elite_costs, best = _merge(elites, elite_costs, points, costs)
+            if best is not None:
+                self._best = (-float(costs[best]), scores.candidate(best))
+            self._step("search", self._best[0], self._best[1], float(state.std.mean()))
+            arrays = {f"cma.{k}": v for k, v in mjx_cmaes.save_state(state).items()}
+            self._saved = ({"best": self._best_values()}, {**arrays, "elites": elites, "elite_costs": elite_costs})
+            self._save()
+        return "The budget of rollouts is spent.", [np.clip(state.mean, 0, 1), *elites]
+
+    def _best_values(self) -> list[float]:
+        fitness, scores = self._best
+        return [fitness, float(scores.iou[0]), float(scores.epe[0])]
+
+    # Finish -------------------------------------------------------------------------------------------------------
+
+    def _finish(self, start: Start, space: Space, points: list[np.ndarray]) -> tuple[Scene, Scores]:
+        """The best of start, landings and elites at full resolution, by C MuJoCo."""
+        scenes = [start.given, start.scene] + [space.scene_at(np.clip(p, 0.0, 1.0)) for p in points]
+        scores = self.problem.score(scenes, start.matching)
+        best = int(np.argmax(np.where(np.isfinite(scores.fitness), scores.fitness, -np.inf)))
+        first = self.problem.starts[0]
+        if first is not start and first.fitness > scores.fitness[best]:
+            return first.given, first.scores
+        return scenes[best], scores.candidate(best)
+
+    # Bookkeeping --------------------------------------------------------------------------------------------------
+
+    def _step(self, phase: str, fitness: float, scores: Scores, spread: float) -> None:
+        iteration = sum(step.phase == phase for step in self.history)
+        step = Step(
+            phase=phase,
+            iteration=iteration,
+            evaluations=self.evaluations,
+            budget=self.options.budget,
+            seconds=self.seconds,
+            fitness=fitness,
+            iou=float(scores.iou[0]),
+            epe=float(scores.epe[0]),
+            spread=spread,
+        )
+        self.history.append(step)
+        self.progress.step(step)
+
+    def _save(self, force: bool = False) -> None:
+        """Writes the checkpoint, at most once a second unless forced: a lost second is computed again."""
+        if self.path is None or not (force or time.monotonic() - self._written > CHECKPOINT_SECONDS):
+            return
+        values = {
+            "digest": self.digest,
+            "evaluations": self.evaluations,
+            "seconds": self.seconds,
+            "history": [dataclasses.astuple(step) for step in self.history],
+            "landed": [[r.rank, r.fitness, r.iou] for r in self.landed],
+            "searching": self._saved is not None,
+        }
+        arrays = {}
+        for r in self.landed:
+            arrays[f"landed.{r.rank}.point"], arrays[f"landed.{r.rank}.covariance"] = r.point, r.covariance
+        if self._saved is not None:
+            values.update(self._saved[0])
+            arrays.update(self._saved[1])
+        save_checkpoint(self.path, values, arrays)
+        self._written = time.monotonic()
+
+    def _restore(self, loaded) -> None:
+        if loaded is None:
+            self.progress.message("no checkpoint yet: starting from the beginning")
+            return
+        values, arrays = loaded
+        self.evaluations, self.before = values["evaluations"], values["seconds"]
+        self.history = [Step(*row) for row in values["history"]]
+        for rank, fitness, iou in values["landed"]:
+            point, covariance = arrays[f"landed.{rank}.point"], arrays[f"landed.{rank}.covariance"]
+            self.landed.append(Landed(rank, point, covariance, fitness, iou))
+        if values["searching"]:
+            fitness, iou, epe = values["best"]
+            self._best = (fitness, _Shown(np.array([iou]), np.array([epe])))
+            self._saved = (values, arrays)
+        self.progress.message(f"resumed after {self.evaluations} rollouts")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Shown:
+    """The two scores that a display needs."""
+
+    iou: np.ndarray
+    epe: np.ndarray
+
+
+def _merge(
+    elites: Float[np.ndarray, "elites dimension"], elite_costs: np.ndarray, points: np.ndarray, costs: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, int | None]:
+    """The best of old elites and new points, and the row of a new overall best (None where there is none)."""
+    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+    improved = costs[best] < elite_costs.min()
+    together, prices = np.concatenate([elites, points]), np.concatenate([elite_costs, costs])
+    order = np.argsort(np.where(np.isfinite(prices), prices, np.inf), kind="stable")[:ELITES]
+    return together[order], prices[order], best if improved else None
