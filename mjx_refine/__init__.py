@@ -1,1 +1,30 @@
-"""Turns a rough guess of a scene into a MuJoCo simulation that replays a video."""
+"""Turns a rough guess of a scene into a MuJoCo simulation that replays a video.
+
+    samples = load_scenes("best32.yaml")
+    observation = load_observation("flows.npz")
+    result = refine(samples, observation, Options(seed=0))
+    save_scene("refined.yaml", result.scene)
+"""
+
+from mjx_refine.errors import InputError
+from mjx_refine.observation import Observation, load_observation, make_observation, save_observation
+from mjx_refine.scene import Scene, load_scene, load_scenes, parse_scenes, save_scene, save_scenes
+from mjx_refine.search import Options, Progress, RefineResult, refine
+
+__all__ = [
+    "InputError",
+    "Observation",
+    "Options",
+    "Progress",
+    "RefineResult",
+    "Scene",
+    "load_observation",
+    "load_scene",
+    "load_scenes",
+    "make_observation",
+    "parse_scenes",
+    "refine",
+    "save_observation",
+    "save_scene",
+    "save_scenes",
+]

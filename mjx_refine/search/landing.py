@@ -156,7 +156,9 @@ class LeastSquares:
         """Whether another Jacobian and line search would exceed the limit."""
         return self.evaluations + self.space.dimension + 2 * len(DAMPINGS) > self.limit
 
-    def run(self, start: np.ndarray, schedule: list[Stage], progress: Callable[[Stage, np.ndarray], None] | None = None) -> Landing:
+    def run(
+        self, start: np.ndarray, schedule: list[Stage], progress: Callable[[Stage, np.ndarray], None] | None = None
+    ) -> Landing:
         """Goes through the stages from ``start``."""
         before = self.evaluations
         generator = np.random.default_rng(self.seed)

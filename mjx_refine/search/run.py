@@ -17,6 +17,7 @@ from mjx_refine.search.landing import LeastSquares, stages
 from mjx_refine.search.objective import Objective
 from mjx_refine.search.problem import Problem, Start
 from mjx_refine.search.progress import Progress, Step
+from mjx_refine.search.undetermined import back_to_start, insensitive
 from mjx_refine.sim.backends import make_simulator
 from mjx_refine.space import Space
 
@@ -51,12 +52,24 @@ class Landed:
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """What the search found: the winning start, its space, the best point and how it was reached."""
+    """What the search found: the winning start, its space, the best scene and how it was reached.
+
+    Attributes:
+      start, space: what the scene was refined from.
+      scene, scores: the best scene and its full-resolution scores by C MuJoCo.
+      values: of the space's parameters.
+      undetermined: names of those that the clip does not determine.
+      history, evaluations, reason: the way there.
+      backend, device: what searched.
+      searched: seconds of the population search.
+    """
 
     start: Start
     space: Space
     scene: Scene
     scores: Scores
+    values: tuple[float, ...]
+    undetermined: tuple[str, ...]
     history: tuple[Step, ...]
     evaluations: int
     reason: str
@@ -118,12 +131,8 @@ class Run:
             objective = self._objective(start, space, simulator)
             reason, found = self._search(objective, mean, covariance)
             elites += found
-        scene, scores = self._finish(start, space, elites)
         return Found(
-            start=start,
-            space=space,
-            scene=scene,
-            scores=scores,
+            **self._finish(start, space, elites, self._objective(start, space)),
             history=tuple(self.history),
             evaluations=self.evaluations,
             reason=reason,
@@ -158,7 +167,7 @@ class Run:
         space = Space.around(start.scene)
         reference = self.problem.reference(start.scene.shapes)
         columns, image = self.problem.columns(start.matching), self.problem.observation.size
-        squares = LeastSquares(space, reference.rollout, self.problem.seen, columns, image, limit)
+        squares = LeastSquares(space, reference.rollout, self.problem.seen, columns, image, limit, self.options.seed)
         objective = self._objective(start, space)
         before = self.evaluations
 
@@ -173,7 +182,9 @@ class Run:
         curvature = np.linalg.inv(landing.covariance * (1 / np.outer(space.sigma, space.sigma)))
         loose = (curvature - np.eye(len(curvature))) / INFLATION + np.eye(len(curvature))
         covariance = np.linalg.inv(loose) * np.outer(space.sigma, space.sigma)
-        return Landed(rank, landing.point, (covariance + covariance.T) / 2, float(scores.fitness[0]), float(scores.iou[0]))
+        return Landed(
+            rank, landing.point, (covariance + covariance.T) / 2, float(scores.fitness[0]), float(scores.iou[0])
+        )
 
     def _beginning(self) -> tuple[Start, Space, np.ndarray, np.ndarray]:
         """Where the population search starts: the best landing, or the best sample."""
@@ -225,15 +236,35 @@ class Run:
 
     # Finish -------------------------------------------------------------------------------------------------------
 
-    def _finish(self, start: Start, space: Space, points: list[np.ndarray]) -> tuple[Scene, Scores]:
-        """The best of start, landings and elites at full resolution, by C MuJoCo."""
-        scenes = [start.given, start.scene] + [space.scene_at(np.clip(p, 0.0, 1.0)) for p in points]
-        scores = self.problem.score(scenes, start.matching)
-        best = int(np.argmax(np.where(np.isfinite(scores.fitness), scores.fitness, -np.inf)))
+    def _finish(self, start: Start, space: Space, points: list[np.ndarray], objective: Objective) -> dict:
+        """The best of samples, landing and elites at full resolution, by C MuJoCo, as fields of ``Found``."""
+        points = [np.clip(p, 0.0, 1.0) for p in points]
+        costs = self._full_costs(space, start, np.array(points))
+        point = points[int(np.argmin(costs))]
+        loose = insensitive(space, point, lambda p: objective(p)[0])
+        point = back_to_start(space, point, loose, lambda p: self._full_costs(space, start, p))
+        scene = space.scene_at(point)
+        scores = self.problem.score([scene], start.matching)
         first = self.problem.starts[0]
-        if first is not start and first.fitness > scores.fitness[best]:
-            return first.given, first.scores
-        return scenes[best], scores.candidate(best)
+        if not scores.fitness[0] >= first.fitness:
+            # Nothing better than the best sample as it came.
+            space = Space.around(first.scene)
+            start, point, scene, scores = first, space.start, first.given, first.scores
+            loose = np.zeros(space.dimension, bool)
+        names = tuple(n for n, free in zip(space.names, loose, strict=True) if free)
+        values = tuple(float(v) for v in space.values(point))
+        return {
+            "start": start,
+            "space": space,
+            "scene": scene,
+            "scores": scores,
+            "undetermined": names,
+            "values": values,
+        }
+
+    def _full_costs(self, space: Space, start: Start, points: np.ndarray) -> np.ndarray:
+        scores = self.problem.score([space.scene_at(p) for p in points], start.matching)
+        return np.where(np.isfinite(scores.fitness), -scores.fitness, np.inf)
 
     # Bookkeeping --------------------------------------------------------------------------------------------------
 

@@ -80,9 +80,7 @@ class MujocoSimulator:
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
         model.pair_margin[:] = 0.0
-        return [
-            (int(c.geom[0]) - 1, int(c.geom[1]) - 1, float(c.dist), np.array(c.frame[:3])) for c in data.contact
-        ]
+        return [(int(c.geom[0]) - 1, int(c.geom[1]) - 1, float(c.dist), np.array(c.frame[:3])) for c in data.contact]
 
     def overlap(self, batch: SceneBatch) -> Float[np.ndarray, "batch"]:
         """Deepest penetration between two objects in the first frame [m], 0 where none touch."""

@@ -1,0 +1,91 @@
+"""What a refinement returns."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+from mjx_fitness import Scores
+
+from mjx_refine.scene import Problem as SampleProblem
+from mjx_refine.scene import Scene
+from mjx_refine.search.options import Options
+from mjx_refine.search.progress import Step
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterRow:
+    """One continuous parameter before and after.
+
+    Attributes:
+      name: as in ``Space``.
+      unit: of both values.
+      before: in the sample that was refined.
+      after: in the refined scene.
+      determined: whether the clip's score depends on it.
+      note: why not, or empty.
+    """
+
+    name: str
+    unit: str
+    before: float
+    after: float
+    determined: bool
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """A scene simulated by C MuJoCo and drawn at full resolution, with its scores (a batch of one)."""
+
+    scene: Scene
+    poses: Float[np.ndarray, "frames objects 7"]
+    masks: Int[np.ndarray, "frames height width"]
+    flow: Float[np.ndarray, "intervals height width 2"]
+    scores: Scores
+
+
+@dataclasses.dataclass(frozen=True)
+class RefineResult:
+    """A refined scene and the proof.
+
+    Attributes:
+      options: what was asked for.
+      init: the best sample as it was given, replayed.
+      init_index: its index in the file.
+      refined: the refined scene, replayed.
+      start_index: index of the sample that the refined scene came from; not always the best one.
+      moved: how far overlapping objects of that sample were pushed apart at the start [m].
+      matching: for each object its mask's id, or -1.
+      parameters: before and after.
+      fixed: (name, reason) of what no search could tell.
+      history: a row a step.
+      evaluations: rollouts spent, in units of the whole clip.
+      reason: why the search ended.
+      backend, device: what searched; the scores are always C MuJoCo's.
+      seconds: total, compile, search.
+      problems: samples that could not be read.
+    """
+
+    options: Options
+    init: Replay
+    init_index: int
+    refined: Replay
+    start_index: int
+    moved: float
+    matching: tuple[int, ...]
+    parameters: tuple[ParameterRow, ...]
+    fixed: tuple[tuple[str, str], ...]
+    history: tuple[Step, ...]
+    evaluations: int
+    reason: str
+    backend: str
+    device: str
+    seconds: dict[str, float]
+    problems: tuple[SampleProblem, ...] = ()
+
+    @property
+    def scene(self) -> Scene:
+        """The refined scene."""
+        return self.refined.scene
