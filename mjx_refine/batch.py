@@ -134,6 +134,4 @@ def scene_from_batch(batch: SceneBatch, row: int, like: Scene) -> Scene:
         orientation=float(np.rad2deg(batch.camera_pitch[row])),
         fovy=float(np.rad2deg(batch.camera_fovy[row])),
     )
-    return dataclasses.replace(
-        like, objects=tuple(bodies), camera=camera, gravity=tuple(batch.gravity[row].tolist())
-    )
+    return dataclasses.replace(like, objects=tuple(bodies), camera=camera, gravity=tuple(batch.gravity[row].tolist()))

@@ -19,9 +19,7 @@ def _replacing(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be written ({error.strerror or error}); choose another place"
-        ) from error
+        raise InputError(f"{path}: cannot be written ({error.strerror or error}); choose another place") from error
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -57,9 +55,7 @@ def writable_directory(path: str | os.PathLike) -> Path:
     while not existing.exists() and existing != existing.parent:
         existing = existing.parent
     if not existing.is_dir():
-        raise InputError(
-            f"{path}: {existing} is a file; expected a directory to write in; name another --out"
-        )
+        raise InputError(f"{path}: {existing} is a file; expected a directory to write in; name another --out")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise InputError(f"{path}: no permission to write in {existing}; name another --out")
     return path

@@ -64,22 +64,14 @@ def load_observation(path: str | os.PathLike) -> Observation:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError, MemoryError) as error:
-        reason = (
-            "it holds pickled objects"
-            if "allow_pickle" in str(error) or "Object arrays" in str(error)
-            else error
-        )
-        raise InputError(
-            f"{path}: cannot be read as npz ({reason}); expected numpy.savez of plain arrays"
-        ) from error
+        reason = "it holds pickled objects" if "allow_pickle" in str(error) or "Object arrays" in str(error) else error
+        raise InputError(f"{path}: cannot be read as npz ({reason}); expected numpy.savez of plain arrays") from error
     for key in arrays:
         if key not in _KEYS:
             raise InputError(f"{path}: unknown key {key!r}; expected {', '.join(_KEYS)}; remove or rename it")
     for key in ("flow", "fps"):
         if key not in arrays:
-            raise InputError(
-                f"{path}: the key {key!r} is missing; found {', '.join(arrays) or 'nothing'}; add it"
-            )
+            raise InputError(f"{path}: the key {key!r} is missing; found {', '.join(arrays) or 'nothing'}; add it")
     return make_observation(source=str(path), **arrays)
 
 
@@ -92,9 +84,7 @@ def _check_sizes(path: Path) -> None:
             for info in archive.infolist():
                 with archive.open(info) as stream:
                     version = np.lib.format.read_magic(stream)
-                    read = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}[
-                        version[0]
-                    ]
+                    read = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}[version[0]]
                     shape, _, dtype = read(stream)
                 count = int(np.prod([int(n) for n in shape], dtype=object)) if shape else 1
                 if count > MAX_ELEMENTS or count * dtype.itemsize > info.file_size:
@@ -105,9 +95,7 @@ def _check_sizes(path: Path) -> None:
     except (zipfile.BadZipFile, OSError, EOFError) as error:
         raise InputError(f"{path}: not a readable npz file ({error}); write it with numpy.savez") from error
     except (ValueError, KeyError, NotImplementedError, RuntimeError, TypeError, SyntaxError) as error:
-        raise InputError(
-            f"{path}: not an npz of plain arrays ({error}); write it with numpy.savez"
-        ) from error
+        raise InputError(f"{path}: not an npz of plain arrays ({error}); write it with numpy.savez") from error
 
 
 def make_observation(
@@ -136,18 +124,14 @@ def make_observation(
     if min(height, width) < 8:
         raise InputError(f"{source}: frames of {width}x{height}; expected at least 8x8 pixels")
     if np.isinf(flow).any():
-        raise InputError(
-            f"{source}: flow holds infinities; expected finite numbers, or NaN where it was not measured"
-        )
+        raise InputError(f"{source}: flow holds infinities; expected finite numbers, or NaN where it was not measured")
     if masks is None and not np.isfinite(flow).any():
         raise InputError(f"{source}: flow is NaN everywhere and there are no masks; nothing was measured")
     return Observation(
         flow=flow.astype(np.float32),
         masks=None if masks is None else _masks(np.asarray(masks), (intervals + 1, height, width), source),
         fps=_fps(fps, source),
-        frames=None
-        if frames is None
-        else _frames(np.asarray(frames), (intervals + 1, height, width, 3), source),
+        frames=None if frames is None else _frames(np.asarray(frames), (intervals + 1, height, width, 3), source),
         flow_sigma=None if flow_sigma is None else _sigma(np.asarray(flow_sigma), flow.shape[:3], source),
         source=source,
     )
@@ -156,14 +140,10 @@ def make_observation(
 def _fps(fps: float | np.ndarray, source: str) -> float:
     array = np.asarray(fps)
     if array.size != 1 or array.dtype.kind not in "fiu":
-        raise InputError(
-            f"{source}: fps has shape {array.shape} and dtype {array.dtype}; expected one number"
-        )
+        raise InputError(f"{source}: fps has shape {array.shape} and dtype {array.dtype}; expected one number")
     value = float(array.reshape(()))
     if not 0.1 <= value <= 1e5:
-        raise InputError(
-            f"{source}: fps = {value:g}; expected 0.1 <= fps <= 100000 frames a second; correct it"
-        )
+        raise InputError(f"{source}: fps = {value:g}; expected 0.1 <= fps <= 100000 frames a second; correct it")
     return value
 
 
@@ -171,13 +151,9 @@ def _masks(masks: np.ndarray, shape: tuple[int, ...], source: str) -> np.ndarray
     if masks.dtype.kind not in "iub":
         raise InputError(f"{source}: masks have dtype {masks.dtype}; expected integer ids (0 = background)")
     if masks.shape != shape:
-        raise InputError(
-            f"{source}: masks have shape {masks.shape}; expected {shape} (one frame more than the flow)"
-        )
+        raise InputError(f"{source}: masks have shape {masks.shape}; expected {shape} (one frame more than the flow)")
     if masks.dtype.kind != "b" and (masks.min() < 0 or masks.max() > 2**30):
-        raise InputError(
-            f"{source}: mask ids lie in [{masks.min()}, {masks.max()}]; expected 0 <= id <= 2^30"
-        )
+        raise InputError(f"{source}: mask ids lie in [{masks.min()}, {masks.max()}]; expected 0 <= id <= 2^30")
     if not masks.any():
         raise InputError(
             f"{source}: masks are empty in every frame; expected at least one object; see `refine observe`"
@@ -195,9 +171,7 @@ def _frames(frames: np.ndarray, shape: tuple[int, ...], source: str) -> np.ndarr
 
 def _sigma(sigma: np.ndarray, shape: tuple[int, ...], source: str) -> float | np.ndarray:
     if sigma.dtype.kind not in "fiu" or sigma.shape not in ((), shape):
-        raise InputError(
-            f"{source}: flow_sigma is {sigma.dtype} {sigma.shape}; expected one number or shape {shape}"
-        )
+        raise InputError(f"{source}: flow_sigma is {sigma.dtype} {sigma.shape}; expected one number or shape {shape}")
     if not (sigma[np.isfinite(sigma)] >= 0).all() or not np.isfinite(sigma).any():
         raise InputError(f"{source}: flow_sigma holds negative or no finite numbers; expected pixels >= 0")
     return float(sigma) if sigma.ndim == 0 else sigma.astype(np.float32)

@@ -69,7 +69,7 @@ def refine(
     enable_cache()
     resolve_backend(options.backend)
     problem = Problem(samples, observation, options)
-    checkpoint = None if folder is None else Path(folder) / CHECKPOINT
+    checkpoint = None if folder is None else _made(Path(folder)) / CHECKPOINT
     run = Run(problem, progress or Progress(), checkpoint, resume)
     found = run()
     first = problem.starts[0]
@@ -98,6 +98,14 @@ def refine(
         },
         problems=samples.problems,
     )
+
+
+def _made(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}); expected a folder to write in") from error
+    return folder
 
 
 def _as_samples(samples: Samples | Scene | list[Scene]) -> Samples:

@@ -208,7 +208,7 @@ class Run:
             state = mjx_cmaes.init(settings, mean, covariance=covariance, seed=self.options.seed)
             elites, elite_costs = mean[None], np.full(1, np.inf)
         else:
-            values, arrays = self._saved
+            arrays = self._saved[1]
             state = mjx_cmaes.load_state(settings, {k[4:]: v for k, v in arrays.items() if k.startswith("cma.")})
             elites, elite_costs = arrays["elites"], arrays["elite_costs"]
         while self.evaluations + self.options.population <= self.options.budget:

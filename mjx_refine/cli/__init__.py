@@ -1,0 +1,5 @@
+"""The command line ``refine``."""
+
+from mjx_refine.cli.main import main
+
+__all__ = ["main"]
