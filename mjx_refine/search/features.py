@@ -72,3 +72,32 @@ def _measure(frame: np.ndarray, i: int, normals: np.ndarray):
     rows, columns = rows[extreme] + top, columns[extreme] + left
     cut = (rows < 2) | (columns < 2) | (rows >= height - 2) | (columns >= width - 2) | others
     return area, centre, np.where(cut, np.nan, reach)
+
+
+POINTS = 12
+"""Pixels of each mask at which the flow is compared."""
+
+
+def flow_points(
+    masks: Int[np.ndarray, "frames height width"],
+    flow: Float[np.ndarray, "intervals height width 2"],
+    ids: tuple[int, ...],
+) -> tuple[Float[np.ndarray, "frames masks points 2"], Float[np.ndarray, "frames masks points 2"]]:
+    """(pixel centres, observed flow [px/frame]) at points spread over the inside of every mask.
+
+    Flow is NaN where there is none to compare: no mask, a tiny one, not measured, the last frame.
+    """
+    pixels = np.zeros((len(masks), len(ids), POINTS, 2))
+    seen = np.full_like(pixels, np.nan)
+    for t in range(len(flow)):
+        for j, i in enumerate(ids):
+            # Flow is measured worst at the edge.
+            inside = ndimage.binary_erosion(masks[t] == i, iterations=2)
+            rows, columns = np.nonzero(inside & np.isfinite(flow[t]).all(-1))
+            if len(rows) < POINTS:
+                continue
+            chosen = np.linspace(0, len(rows) - 1, POINTS + 2).astype(int)[1:-1]
+            rows, columns = rows[chosen], columns[chosen]
+            pixels[t, j] = np.stack([columns + 0.5, rows + 0.5], -1)
+            seen[t, j] = flow[t, rows, columns]
+    return pixels, seen

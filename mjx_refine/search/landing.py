@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.batch import SceneBatch
-from mjx_refine.search.features import DIRECTIONS, Outlines
+from mjx_refine.search.features import DIRECTIONS, POINTS, Outlines
 from mjx_refine.space import Space
 from mjx_refine.view.outline import supports
+from mjx_refine.view.points import point_flow
 
 DAMPINGS = np.array([1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0])
 """Multiples of the prior's curvature that one line search tries."""
@@ -33,6 +34,12 @@ MISFIT = 1.5
 
 TURNS = ("yaw", "tilt", "lean")
 """Fields of the parameter space that turn an object at the start."""
+
+FLOW_NOISE = 1.0
+"""Standard deviation of measured flow inside a mask [px at a picture 480 wide]."""
+
+FLOW_SCALE = 2.0
+"""Scale of its robust loss: measured flow of fast-spinning bodies is wrong by several pixels."""
 
 NOISE_FLOOR = 0.5
 """Standard deviation of a mask's edge [px at a picture 480 wide]."""
@@ -86,6 +93,7 @@ class LeastSquares:
       seen: the observed outlines.
       columns: for each object the column of ``seen`` that belongs to it, or -1.
       image: (width, height) [px].
+      flow: pixels and observed flow of every mask (``flow_points``), or None to go by outlines alone.
       limit: rollouts that may be spent.
       seed: of the points tried when the horizon grows.
     """
@@ -97,6 +105,7 @@ class LeastSquares:
         seen: Outlines,
         columns: tuple[int, ...],
         image: tuple[int, int],
+        flow: tuple[np.ndarray, np.ndarray] | None = None,
         limit: int = 10**9,
         seed: int = 0,
     ):
@@ -108,10 +117,12 @@ class LeastSquares:
             if j >= 0:
                 target[:, n] = seen.support[:, j]
         self.target = target
+        self.pixels, self.flow = _of_objects(flow, columns)
         self.spent = 0.0
 
-    def _distances(self, points: np.ndarray, frames: int) -> tuple[np.ndarray, np.ndarray]:
-        """(simulated minus observed reach (B, frames, N, directions) [px at 480 wide], whether a candidate diverged)."""
+    def _distances(self, points: np.ndarray, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Simulated minus observed reach (B, frames, N, directions) and flow (B, frames, N, 2 * points), both in px at
+        480 wide, and whether a candidate diverged."""
         batch = self.space.decode(points)
         poses = self.rollout(batch, frames)
         self.spent += len(points) * frames / len(self.target)
@@ -119,21 +130,33 @@ class LeastSquares:
         poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
         # The outlines of all frames, so that one length is compiled; those beyond the horizon repeat its last.
         beyond = np.repeat(poses[:, -1:], len(self.target) - frames, axis=1)
-        reach = supports(np.concatenate([poses, beyond], 1), batch, self.image, DIRECTIONS)[:, :frames]
-        return (reach - self.target[:frames]) / self.pixel, bad
+        poses = np.concatenate([poses, beyond], 1)
+        reach = supports(poses, batch, self.image, DIRECTIONS)[:, :frames] - self.target[:frames]
+        flow = np.full((len(points), frames, len(batch.shapes), 0), np.nan)
+        if self.flow is not None and frames > 1:
+            moved = point_flow(poses, batch, self.pixels, self.image)[:, :frames] - self.flow[:frames]
+            moved[:, frames - 1] = np.nan
+            flow = moved.reshape(*moved.shape[:3], -1)
+        return reach / self.pixel, flow / self.pixel, bad
 
-    def _robust(self, raw: np.ndarray, scale: float) -> np.ndarray:
-        """Residuals in noise widths whose growth slows beyond ``scale`` but never ends: a pull at any distance.
+    def _robust(self, reach: np.ndarray, flow: np.ndarray, scale: float) -> np.ndarray:
+        """Residuals in noise widths, (B, frames, N, directions + 2 * points), zero where nothing was seen.
 
-        Edges of one mask are not independent: its directions together count as six.
+        Their growth slows beyond ``scale`` but never ends: a pull at any distance. Neither the edges of one mask nor the
+        flow at its points are independent: its directions together count as six, its flow as two vectors.
         """
-        slowed = np.sign(raw) * scale * np.sqrt(np.log1p((raw / scale) ** 2))
-        return slowed * (np.sqrt(6 / DIRECTIONS) / NOISE_FLOOR)
+
+        def slowed(raw: np.ndarray, scale: float) -> np.ndarray:
+            return np.sign(raw) * scale * np.sqrt(np.log1p((raw / scale) ** 2))
+
+        edges = slowed(np.nan_to_num(reach), scale) * (np.sqrt(6 / DIRECTIONS) / NOISE_FLOOR)
+        motion = slowed(np.nan_to_num(flow), FLOW_SCALE) * (np.sqrt(2 / POINTS) / FLOW_NOISE)
+        return np.concatenate([edges, motion], -1)
 
     def residuals(self, points: np.ndarray, frames: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
         """(robust residuals (B, R), their half sum of squares with the prior (B,))."""
-        raw, bad = self._distances(points, frames)
-        robust = self._robust(np.nan_to_num(raw.reshape(len(points), -1)), scale)
+        reach, flow, bad = self._distances(points, frames)
+        robust = self._robust(reach, flow, scale).reshape(len(points), -1)
         prior = (points - self.space.start) / self.space.sigma
         cost = 0.5 * (robust**2).sum(-1) + 0.5 * (prior**2).sum(-1)
         return robust, np.where(bad, np.inf, cost)
@@ -211,8 +234,8 @@ class LeastSquares:
         points = self._draws(before, jacobian, generator)
         keep = ~np.isin(owner, np.nonzero(misfit)[0])
         points[:, keep] = now[keep]
-        raw, bad = self._distances(points, stage.frames)
-        prices = np.nansum(0.5 * self._robust(raw, stage.scale) ** 2, (1, 3)) + np.where(bad, 1e12, 0.0)[:, None]
+        reach, flow, bad = self._distances(points, stage.frames)
+        prices = 0.5 * (self._robust(reach, flow, stage.scale) ** 2).sum((1, 3)) + np.where(bad, 1e12, 0.0)[:, None]
         combined = now.copy()
         for n in np.nonzero(misfit)[0]:
             combined[owner == n] = points[int(np.argmin(prices[:, n]))][owner == n]
@@ -271,3 +294,13 @@ class LeastSquares:
         step[free] = -np.linalg.solve(matrix, gradient[free])
         length = np.abs(step).max(initial=0.0)
         return step * min(1.0, 3.0 / max(length, 1e-12))
+
+
+def _of_objects(flow, columns: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Pixels and flow of each object's mask; flow is NaN for an object without one."""
+    if flow is None:
+        return np.zeros(0), None
+    pixels, seen = flow
+    chosen = [max(j, 0) for j in columns]
+    lost = np.array([j < 0 for j in columns])
+    return pixels[:, chosen], np.where(lost[None, :, None, None], np.nan, seen[:, chosen])

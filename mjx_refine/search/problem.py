@@ -11,7 +11,7 @@ from mjx_refine.batch import batch_from_scenes
 from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Samples, Scene, Shape
-from mjx_refine.search.features import Outlines, outlines
+from mjx_refine.search.features import Outlines, flow_points, outlines
 from mjx_refine.search.matching import match_objects
 from mjx_refine.search.options import Options
 from mjx_refine.sim.c import MujocoSimulator
@@ -68,6 +68,7 @@ class Problem:
                 )
         masks = foreground(observation)
         self.seen: Outlines = outlines(masks)
+        self.flow = flow_points(masks, observation.flow, self.seen.ids)
         self.starts = self._ranked()
 
     def reference(self, shapes: tuple[Shape, ...]) -> MujocoSimulator:

@@ -167,7 +167,7 @@ class Run:
         space = Space.around(start.scene)
         reference = self.problem.reference(start.scene.shapes)
         columns, image = self.problem.columns(start.matching), self.problem.observation.size
-        squares = LeastSquares(space, reference.rollout, self.problem.seen, columns, image, limit, self.options.seed)
+        squares = LeastSquares(space, reference.rollout, self.problem.seen, columns, image, self.problem.flow, limit, self.options.seed)
         objective = self._objective(start, space)
         before = self.evaluations
 

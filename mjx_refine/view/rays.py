@@ -56,7 +56,7 @@ def _cylinder(o: _Vector, d: _Vector, size: _Vector) -> Array:
     return jnp.where((gap > 0.0) & (near < far) & (near > 0.0), near, FAR)
 
 
-_HIT = {"sphere": _sphere, "box": _box, "cylinder": _cylinder}
+HIT = {"sphere": _sphere, "box": _box, "cylinder": _cylinder}
 
 
 def cast(
@@ -82,7 +82,7 @@ def cast(
         ray, origin, size = frames.ray[:, k], frames.origin[:, k], frames.size[:, k]
         d = tuple(ray[:, i, 0, None] * u + ray[:, i, 1, None] * v - ray[:, i, 2, None] for i in range(3))
         o = tuple(origin[:, i, None] for i in range(3))
-        t = _HIT[shape](o, d, tuple(size[:, i, None] for i in range(3)))
+        t = HIT[shape](o, d, tuple(size[:, i, None] for i in range(3)))
         nearer = t < best
         best = jnp.where(nearer, t, best)
         ids = jnp.where(nearer, k + 1, ids)

@@ -1,0 +1,60 @@
+"""Simulated flow at given pixels, object by object, without drawing a picture."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.scene import Shape
+from mjx_refine.view.frames import make_frames
+from mjx_refine.view.outline import BATCHES
+from mjx_refine.view.rays import FAR, HIT
+
+
+@functools.partial(jax.jit, static_argnames=("shapes", "image"))
+def _point_flow(shapes: tuple[Shape, ...], arrays, pixels: Array, image: tuple[int, int]):
+    poses, size, position, pitch, fovy = arrays
+    batch, length = poses.shape[:2]
+    frames = make_frames(poses, size, position, pitch, fovy, image[1])
+    tiled = jnp.broadcast_to(pixels[None], (batch, *pixels.shape)).reshape(batch * length, *pixels.shape[1:])
+    focal = frames.focal[:, None]
+    result = []
+    for n, shape in enumerate(shapes):
+        x, y = tiled[:, n, :, 0], tiled[:, n, :, 1]
+        u, v = (x - image[0] / 2) / focal, -(y - image[1] / 2) / focal
+        ray, origin, extent = frames.ray[:, n], frames.origin[:, n], frames.size[:, n]
+        d = tuple(ray[:, i, 0, None] * u + ray[:, i, 1, None] * v - ray[:, i, 2, None] for i in range(3))
+        o = tuple(origin[:, i, None] for i in range(3))
+        t = HIT[shape](o, d, tuple(extent[:, i, None] for i in range(3)))
+        # A ray that misses takes the point beside the object that is as far away as its centre.
+        beside = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        t = jnp.where(t < FAR, t, beside)
+        hit = tuple(oi + t * di for oi, di in zip(o, d, strict=True))
+        matrix, offset = frames.next_matrix[:, n], frames.next_offset[:, n]
+        cx, cy, cz = (sum(matrix[:, i, j, None] * hit[j] for j in range(3)) + offset[:, i, None] for i in range(3))
+        depth = jnp.maximum(-cz, 0.02)
+        result.append(jnp.stack([focal * cx / depth + image[0] / 2 - x, -focal * cy / depth + image[1] / 2 - y], -1))
+    return jnp.stack(result, 1).reshape(batch, length, len(shapes), -1, 2)
+
+
+def point_flow(
+    poses: Float[np.ndarray, "batch frames objects 7"],
+    batch: SceneBatch,
+    pixels: Float[np.ndarray, "frames objects points 2"],
+    image: tuple[int, int],
+) -> Float[np.ndarray, "batch frames objects points 2"]:
+    """Flow [px/frame] of each object's surface where it is seen at ``pixels`` (x, y) [px], as if nothing hid it.
+
+    Where the ray misses the object, that of a point fixed to it beside its outline; zero in the last frame.
+    """
+    arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
+    size = next((b for b in BATCHES if b >= len(poses)), -(-len(poses) // BATCHES[-1]) * BATCHES[-1])
+    padded = tuple(
+        jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32) for a in map(np.asarray, arrays)
+    )
+    return np.asarray(_point_flow(batch.shapes, padded, jnp.asarray(pixels, jnp.float32), image))[: len(poses)]
