@@ -4,18 +4,32 @@ from __future__ import annotations
 
 import math
 import re
+import reprlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from mjx_refine.errors import InputError
+
+# Nested aliases make a short text's value astronomically long, so that its whole repr must never be made.
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxdict, _SHORT.maxlist, _SHORT.maxtuple, _SHORT.maxset = 3, 4, 4, 4, 4
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 def show(value: object) -> str:
     """A value, short enough for an error's one line."""
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    try:
+        text = _SHORT.repr(value)
+    except ValueError:  # Python refuses to print whole numbers of thousands of digits
+        text = f"a {type(value).__name__} too long to print"
+    return cut(text, 60)
+
+
+def cut(text: str, most: int = 200) -> str:
+    """A text, short enough for an error's one line."""
+    return text if len(text) <= most else text[: most - 3] + "..."
 
 
 def mapping(value: object, place: str, allowed: Iterable[str]) -> Mapping[str, Any]:
@@ -31,6 +45,11 @@ def mapping(value: object, place: str, allowed: Iterable[str]) -> Mapping[str, A
     return value
 
 
+def is_number_text(value: object) -> bool:
+    """Whether ``value`` is a text that spells a number."""
+    return isinstance(value, str) and _NUMBER.fullmatch(value.strip()) is not None
+
+
 def number(
     value: object,
     place: str,
@@ -42,8 +61,8 @@ def number(
     """``value`` as a finite float in [low, high], or in (low, high] where ``above``."""
     expectation = f"expected a number, {low:g} {'<' if above else '<='} number <= {high:g}"
     # YAML 1.1 reads 1e-3 (no dot) as text.
-    if isinstance(value, str) and _NUMBER.fullmatch(value.strip()):
-        value = float(value)
+    if is_number_text(value):
+        value = float(value)  # type: ignore[arg-type]
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{place} = {show(value)}; {expectation}")
     try:
@@ -55,9 +74,7 @@ def number(
     return result + 0.0  # -0.0 becomes 0.0
 
 
-def vector(
-    value: object, place: str, length: int, low: float = -1e6, high: float = 1e6, *, above: bool = False
-):
+def vector(value: object, place: str, length: int, low: float = -1e6, high: float = 1e6, *, above: bool = False):
     """``value`` as a tuple of ``length`` numbers in [low, high]."""
     if isinstance(value, str | bytes) or not isinstance(value, Sequence) or len(value) != length:
         raise InputError(f"{place} = {show(value)}; expected a list of {length} numbers")

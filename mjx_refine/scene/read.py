@@ -17,6 +17,9 @@ from mjx_refine.scene.model import SHAPES, Body, Camera, Effect, Quaternion, Sce
 from mjx_refine.scene.text import sample_texts
 
 MAX_BYTES = 32 * 2**20
+MAX_SAMPLES = 4096
+MAX_SAMPLE_BYTES = 256 * 2**10
+MAX_NODES = 100_000
 _STATE = ("position", "orientation", "linear_velocity", "angular_velocity")
 _PHYSICS = ("friction", "mass", "damping", "stiffness")
 _SIZE_KEYS = {"box": ("size",), "cylinder": ("radius", "height"), "sphere": ("radius",)}
@@ -82,20 +85,15 @@ def load_scenes(path: str | os.PathLike) -> Samples:
     try:
         with open(path, "rb") as stream:
             content = stream.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); expected a scene file in YAML"
-        ) from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be read ({reason}); expected a scene file in YAML; check the name") from error
     if len(content) > MAX_BYTES:
-        raise InputError(
-            f"{path}: larger than {MAX_BYTES >> 20} MiB; expected scene samples in YAML; split the file"
-        )
+        raise InputError(f"{path}: larger than {MAX_BYTES >> 20} MiB; expected scene samples in YAML; split the file")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: byte {error.start} is not UTF-8; expected a scene file in YAML text"
-        ) from error
+        raise InputError(f"{path}: byte {error.start} is not UTF-8; expected a scene file in YAML text") from error
     return parse_scenes(text, source=str(path))
 
 
@@ -107,9 +105,9 @@ def parse_scenes(text: str, source: str = "<text>") -> Samples:
     """
     texts = sample_texts(text)
     if not texts:
-        raise InputError(
-            f"{source}: no scene in it; expected a YAML list of entries (objects, camera, gravity)"
-        )
+        raise InputError(f"{source}: no scene in it; expected a YAML list of entries (objects, camera, gravity)")
+    if len(texts) > MAX_SAMPLES:
+        raise InputError(f"{source}: {len(texts)} samples; expected at most {MAX_SAMPLES}; remove some")
     scenes: list[Scene] = []
     indices: list[int] = []
     problems: list[Problem] = []
@@ -141,24 +139,70 @@ def load_scene(path: str | os.PathLike) -> Scene:
 
 
 def _parse_scene(text: str, place: str) -> Scene:
+    if len(text) > MAX_SAMPLE_BYTES:
+        raise InputError(
+            f"{place}: a sample of {len(text)} characters; expected at most {MAX_SAMPLE_BYTES}, a scene of 64 objects "
+            "has 40000; remove or split it"
+        )
     try:
-        entries = yaml.load(text, Loader=_UniqueKeyLoader)
+        entries = _load_yaml(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f": line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         problem = getattr(error, "problem", None) or str(error)
-        raise InputError(f"{place}{line}: not safe YAML: {problem}; correct or remove the sample") from error
+        raise InputError(
+            f"{place}{line}: not safe YAML: {fields.cut(problem)}; correct or remove the sample"
+        ) from error
     except (
         ValueError,
         RecursionError,
+        ArithmeticError,
         TypeError,
-        OverflowError,
         AttributeError,
         KeyError,
         IndexError,
     ) as error:
-        raise InputError(f"{place}: not readable YAML: {error}; correct or remove the sample") from error
+        raise InputError(
+            f"{place}: not readable YAML: {fields.cut(str(error))}; correct or remove the sample"
+        ) from error
     return scene_from_entries(entries, place)
+
+
+def _load_yaml(text: str) -> object:
+    """The one document in ``text``, of plain data.
+
+    Raises:
+      yaml.YAMLError: broken, unsafe, or aliases make it refer to itself or grow beyond MAX_NODES.
+    """
+    loader = _UniqueKeyLoader(text)
+    try:
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _expanded_size(node, {})
+        return loader.construct_document(node)
+    finally:
+        loader.dispose()
+
+
+def _expanded_size(node: yaml.Node, known: dict[int, int | None]) -> int:
+    """How many nodes ``node`` holds where every alias counts in full."""
+    if id(node) in known:
+        size = known[id(node)]
+        if size is None:
+            raise yaml.constructor.ConstructorError(None, None, "an alias refers to itself", node.start_mark)
+        return size
+    known[id(node)] = None
+    children = node.value if isinstance(node, yaml.CollectionNode) else ()
+    if isinstance(node, yaml.MappingNode):
+        children = [part for pair in children for part in pair]
+    size = 1 + sum(_expanded_size(child, known) for child in children)
+    if size > MAX_NODES:
+        raise yaml.constructor.ConstructorError(
+            None, None, f"more than {MAX_NODES} values, with aliases written out", node.start_mark
+        )
+    known[id(node)] = size
+    return size
 
 
 def scene_from_entries(entries: object, place: str = "<scene>") -> Scene:
@@ -168,9 +212,7 @@ def scene_from_entries(entries: object, place: str = "<scene>") -> Scene:
       InputError: an entry is wrong; the message names entry and key.
     """
     if isinstance(entries, Mapping) or isinstance(entries, str | bytes) or not isinstance(entries, Sequence):
-        raise InputError(
-            f"{place}: got {fields.show(entries)}; expected a list of entries, each with a `type`"
-        )
+        raise InputError(f"{place}: got {fields.show(entries)}; expected a list of entries, each with a `type`")
     objects: list[Body] = []
     cameras: list[Camera] = []
     gravities: list[tuple[float, float, float]] = []
@@ -186,9 +228,7 @@ def scene_from_entries(entries: object, place: str = "<scene>") -> Scene:
             cameras.append(_camera(entry, where))
         elif kind == "gravity":
             entry = fields.mapping(entry, where, ("type", "gravity"))
-            gravities.append(
-                fields.vector(fields.required(entry, "gravity", where), f"{where}.gravity", 3, -1e3, 1e3)
-            )
+            gravities.append(fields.vector(fields.required(entry, "gravity", where), f"{where}.gravity", 3, -1e3, 1e3))
         elif kind == "effect":
             effects.append(_effect(entry, where))
         else:
@@ -216,22 +256,20 @@ def _check_counts(objects: list, cameras: list, gravities: list, effects: list[E
     for effect in effects:
         if effect.target is not None and effect.target not in names:
             raise InputError(
-                f"{place}: effect {effect.effect}.target = {effect.target!r}; expected an object's name: {', '.join(names)}"
+                f"{place}: effect {effect.effect}.target = {effect.target!r}; "
+                f"expected an object's name: {fields.cut(', '.join(names))}"
             )
 
 
 def _body(entry: Mapping[str, Any], where: str, shape: Any, count: int) -> Body:
-    name = (
-        fields.text(entry["name"], f"{where}.name") if entry.get("name") is not None else f"{shape}_{count}"
-    )
+    name = fields.text(entry["name"], f"{where}.name") if entry.get("name") is not None else f"{shape}_{count}"
     where = f"{where} ({name})"
     entry = fields.mapping(entry, where, ("type", "name", *_SIZE_KEYS[shape], "state", "physics"))
     state = fields.mapping(fields.required(entry, "state", where), f"{where}.state", _STATE)
-    physics = fields.mapping(entry.get("physics") or {}, f"{where}.physics", _PHYSICS)
+    physics = {} if entry.get("physics") is None else entry["physics"]
+    physics = fields.mapping(physics, f"{where}.physics", _PHYSICS)
 
-    def value(
-        source: Mapping[str, Any], key: str, length: int, default: Any, *bounds: float, **options: bool
-    ) -> Any:
+    def value(source: Mapping[str, Any], key: str, length: int, default: Any, *bounds: float, **options: bool) -> Any:
         place = f"{where}.{'state' if source is state else 'physics'}.{key}"
         if source.get(key) is None:
             return default
@@ -245,9 +283,7 @@ def _body(entry: Mapping[str, Any], where: str, shape: Any, count: int) -> Body:
         name=name,
         size=_size(entry, where, shape),
         position=value(state, "position", 3, None, -1e4, 1e4),
-        orientation=_quaternion(
-            value(state, "orientation", 4, Body.orientation), f"{where}.state.orientation"
-        ),
+        orientation=_quaternion(value(state, "orientation", 4, Body.orientation), f"{where}.state.orientation"),
         linear_velocity=value(state, "linear_velocity", 3, Body.linear_velocity, -1e4, 1e4),
         angular_velocity=value(state, "angular_velocity", 3, Body.angular_velocity, -1e4, 1e4),
         friction=value(physics, "friction", 2, Body.friction, 0.0, 10.0),
@@ -261,9 +297,7 @@ def _size(entry: Mapping[str, Any], where: str, shape: str) -> tuple[float, ...]
     if shape == "box":
         return fields.vector(fields.required(entry, "size", where), f"{where}.size", 3, 1e-4, 1e3)
     keys = _SIZE_KEYS[shape]
-    return tuple(
-        fields.number(fields.required(entry, key, where), f"{where}.{key}", 1e-4, 1e3) for key in keys
-    )
+    return tuple(fields.number(fields.required(entry, key, where), f"{where}.{key}", 1e-4, 1e3) for key in keys)
 
 
 def _quaternion(value: tuple[float, ...], place: str) -> Quaternion:
@@ -281,9 +315,7 @@ def _camera(entry: Mapping[str, Any], where: str) -> Camera:
     fovy = entry.get("fovy")
     return Camera(
         position=fields.vector(fields.required(entry, "position", where), f"{where}.position", 3, -1e4, 1e4),
-        orientation=fields.number(
-            fields.required(entry, "orientation", where), f"{where}.orientation", -360, 360
-        ),
+        orientation=fields.number(fields.required(entry, "orientation", where), f"{where}.orientation", -360, 360),
         fovy=Camera.fovy if fovy is None else fields.number(fovy, f"{where}.fovy", 0.1, 175),
     )
 
@@ -292,16 +324,18 @@ def _effect(entry: Mapping[str, Any], where: str) -> Effect:
     where = f"{where} (effect)"
     entry = fields.mapping(entry, where, ("type", "effect", "target", "parameters"))
     target = entry.get("target")
-    raw = entry.get("parameters") or {}
+    raw = {} if entry.get("parameters") is None else entry["parameters"]
     if not isinstance(raw, Mapping):
         raise InputError(f"{where}.parameters = {fields.show(raw)}; expected a mapping of names to numbers")
     parameters = []
     for key, value in raw.items():
         place = f"{where}.parameters.{key}"
         key = fields.text(key, f"{where}.parameters: key")
+        if any(key == other for other, _ in parameters):
+            raise InputError(f"{where}.parameters: {key!r} stands twice; remove one")
         if isinstance(value, list):
             parameters.append((key, fields.vector(value, place, len(value), -1e9, 1e9)))
-        elif isinstance(value, str):
+        elif isinstance(value, str) and not fields.is_number_text(value):
             parameters.append((key, fields.text(value, place)))
         else:
             parameters.append((key, fields.number(value, place, -1e9, 1e9)))

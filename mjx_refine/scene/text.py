@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 
-_THINK = re.compile(r"<think>.*?</think>", re.DOTALL)
 _ANSWER = re.compile(r"<answer>(.*?)(?=</answer>|<answer>|\Z)", re.DOTALL)
 _FENCE = re.compile(r"^[ \t]*```[^\n]*\n(.*?)(?:^[ \t]*```[^\n]*$|\Z)", re.DOTALL | re.MULTILINE)
 _DOCUMENT = re.compile(r"^---(?:[ \t].*)?$", re.MULTILINE)
@@ -17,7 +16,7 @@ def sample_texts(text: str) -> list[str]:
     them; the last may lack its end) and fenced code blocks. Texts are split before they are parsed, so that a broken
     sample leaves the others readable.
     """
-    text = _THINK.sub("\n", text.replace("\r\n", "\n"))
+    text = _without_thoughts(text.replace("\r\n", "\n"))
     answers = [match.group(1) for match in _ANSWER.finditer(text)]
     samples = []
     for part in answers or [text]:
@@ -27,6 +26,15 @@ def sample_texts(text: str) -> list[str]:
             # An empty answer is a sample that failed, and must keep its index.
             samples.extend(documents or ([block] if answers else []))
     return samples
+
+
+def _without_thoughts(text: str) -> str:
+    """Cuts every ``<think>...</think>``, in one pass: a regular expression is quadratic where the ends are missing."""
+    kept, at = [], 0
+    while (start := text.find("<think>", at)) >= 0 and (end := text.find("</think>", start)) >= 0:
+        kept.append(text[at:start])
+        at = end + len("</think>")
+    return "\n".join([*kept, text[at:]])
 
 
 def _has_content(document: str) -> bool:
