@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import lzma
 import os
+import warnings
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,10 @@ from mjx_refine.errors import InputError
 
 _KEYS = ("flow", "masks", "fps", "frames", "flow_sigma")
 MAX_ELEMENTS = 2 * 10**9
+MAX_FLOW = 1e5
+_READERS = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
+_DAMAGED = (OSError, ValueError, EOFError, KeyError, TypeError, SyntaxError, RuntimeError, MemoryError, OverflowError)
+_DAMAGED += (zipfile.BadZipFile, zlib.error, lzma.LZMAError)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,17 +69,27 @@ def load_observation(path: str | os.PathLike) -> Observation:
     _check_sizes(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
+            _check_keys(path, archive.files)
             arrays = {key: archive[key] for key in archive.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError, MemoryError) as error:
-        reason = "it holds pickled objects" if "allow_pickle" in str(error) or "Object arrays" in str(error) else error
-        raise InputError(f"{path}: cannot be read as npz ({reason}); expected numpy.savez of plain arrays") from error
-    for key in arrays:
-        if key not in _KEYS:
-            raise InputError(f"{path}: unknown key {key!r}; expected {', '.join(_KEYS)}; remove or rename it")
-    for key in ("flow", "fps"):
-        if key not in arrays:
-            raise InputError(f"{path}: the key {key!r} is missing; found {', '.join(arrays) or 'nothing'}; add it")
+    except InputError:
+        raise
+    except _DAMAGED as error:
+        reason = (
+            "it holds pickled objects"
+            if "allow_pickle" in str(error) or "Object arrays" in str(error)
+            else str(error)[:200]
+        )
+        raise InputError(f"{path}: cannot be read as npz ({reason}); write it again with numpy.savez") from error
     return make_observation(source=str(path), **arrays)
+
+
+def _check_keys(path: Path, keys: list[str]) -> None:
+    for key in keys:
+        if key not in _KEYS:
+            raise InputError(f"{path}: unknown key {key[:60]!r}; expected {', '.join(_KEYS)}; remove or rename it")
+    for key in ("flow", "fps"):
+        if key not in keys:
+            raise InputError(f"{path}: the key {key!r} is missing; found {', '.join(keys)[:200] or 'nothing'}; add it")
 
 
 def _check_sizes(path: Path) -> None:
@@ -81,21 +98,37 @@ def _check_sizes(path: Path) -> None:
         if not path.is_file():
             raise InputError(f"{path}: no such file; expected an observation (npz with flow, masks, fps)")
         with zipfile.ZipFile(path) as archive:
-            for info in archive.infolist():
-                with archive.open(info) as stream:
-                    version = np.lib.format.read_magic(stream)
-                    read = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}[version[0]]
-                    shape, _, dtype = read(stream)
-                count = int(np.prod([int(n) for n in shape], dtype=object)) if shape else 1
-                if count > MAX_ELEMENTS or count * dtype.itemsize > info.file_size:
-                    raise InputError(
-                        f"{path}: {info.filename} declares {count} numbers, the file holds {info.file_size} bytes "
-                        f"(at most {MAX_ELEMENTS} numbers are read); the file is damaged or too large; write it again"
-                    )
-    except (zipfile.BadZipFile, OSError, EOFError) as error:
-        raise InputError(f"{path}: not a readable npz file ({error}); write it with numpy.savez") from error
-    except (ValueError, KeyError, NotImplementedError, RuntimeError, TypeError, SyntaxError) as error:
-        raise InputError(f"{path}: not an npz of plain arrays ({error}); write it with numpy.savez") from error
+            need = sum(_declared_bytes(path, archive, info) for info in archive.infolist())
+    except InputError:
+        raise
+    except _DAMAGED as error:
+        raise InputError(
+            f"{path}: not a readable npz of plain arrays ({str(error)[:200]}); write it with numpy.savez"
+        ) from error
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if 2 * need > memory:  # the flow is copied once, to float32
+        raise InputError(
+            f"{path}: its arrays take {need / 2**30:.1f} GiB of memory, twice that while they are checked, and this "
+            f"machine has {memory / 2**30:.1f} GiB; write fewer or smaller frames"
+        )
+
+
+def _declared_bytes(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
+    """Bytes that one array takes in memory, if its header agrees with the zip's."""
+    with archive.open(info) as stream, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numpy's on headers of Python 2; a wrong one raises
+        version = np.lib.format.read_magic(stream)
+        shape, _, dtype = _READERS[version[0]](stream)
+    if any(n < 0 for n in shape):
+        raise InputError(f"{path}: {info.filename} has shape {shape}; the file is damaged; write it again")
+    count = int(np.prod([int(n) for n in shape], dtype=object)) if shape else 1
+    size = count * dtype.itemsize
+    if count > MAX_ELEMENTS or (size > info.file_size and not dtype.hasobject):
+        raise InputError(
+            f"{path}: {info.filename} declares {count} numbers, the file holds {info.file_size} bytes "
+            f"(at most {MAX_ELEMENTS} numbers are read); the file is damaged or too large; write it again"
+        )
+    return size
 
 
 def make_observation(
@@ -125,8 +158,15 @@ def make_observation(
         raise InputError(f"{source}: frames of {width}x{height}; expected at least 8x8 pixels")
     if np.isinf(flow).any():
         raise InputError(f"{source}: flow holds infinities; expected finite numbers, or NaN where it was not measured")
+    if (np.abs(flow) > MAX_FLOW).any():
+        raise InputError(
+            f"{source}: flow holds displacements of {np.nanmax(np.abs(flow)):.3g} px/frame; expected at most {MAX_FLOW:g}; "
+            "write NaN where it was not measured"
+        )
     if masks is None and not np.isfinite(flow).any():
-        raise InputError(f"{source}: flow is NaN everywhere and there are no masks; nothing was measured")
+        raise InputError(
+            f"{source}: flow is NaN everywhere and there are no masks; expected numbers somewhere; measure it again"
+        )
     return Observation(
         flow=flow.astype(np.float32),
         masks=None if masks is None else _masks(np.asarray(masks), (intervals + 1, height, width), source),
@@ -174,6 +214,10 @@ def _sigma(sigma: np.ndarray, shape: tuple[int, ...], source: str) -> float | np
         raise InputError(f"{source}: flow_sigma is {sigma.dtype} {sigma.shape}; expected one number or shape {shape}")
     if not (sigma[np.isfinite(sigma)] >= 0).all() or not np.isfinite(sigma).any():
         raise InputError(f"{source}: flow_sigma holds negative or no finite numbers; expected pixels >= 0")
+    if (sigma[np.isfinite(sigma)] > MAX_FLOW).any():
+        raise InputError(
+            f"{source}: flow_sigma holds {sigma[np.isfinite(sigma)].max():.3g}; expected at most {MAX_FLOW:g}"
+        )
     return float(sigma) if sigma.ndim == 0 else sigma.astype(np.float32)
 
 
