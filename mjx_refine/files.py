@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
 from mjx_refine.errors import InputError
+
+_PART = re.compile(r"\..+\.[0-9a-f]{8}\.part", re.DOTALL)
 
 
 @contextlib.contextmanager
@@ -44,6 +47,17 @@ def write_text(path: str | os.PathLike, text: str) -> Path:
     return write_atomic(path, lambda stream: stream.write(text.encode()))
 
 
+def remove_stale_parts(folder: str | os.PathLike) -> None:
+    """Removes temporary files that a killed process left in ``folder``; call it when no other process writes there."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        return
+    for file in folder.iterdir():
+        if _PART.fullmatch(file.name) and file.is_file():
+            with contextlib.suppress(OSError):
+                file.unlink()
+
+
 def writable_directory(path: str | os.PathLike) -> Path:
     """Checks, without making it, that ``path`` is or can become a directory to write in.
 
@@ -51,11 +65,33 @@ def writable_directory(path: str | os.PathLike) -> Path:
       InputError: it cannot.
     """
     path = Path(path)
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as error:  # a name that is too long, or holds a NUL
+        raise InputError(f"{path}: no name for a directory ({error}); name another --out") from error
     existing = path
-    while not existing.exists() and existing != existing.parent:
+    while not os.path.lexists(existing) and existing != existing.parent:
         existing = existing.parent
     if not existing.is_dir():
-        raise InputError(f"{path}: {existing} is a file; expected a directory to write in; name another --out")
+        raise InputError(f"{path}: {existing} is no directory; expected one to write in; name another --out")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise InputError(f"{path}: no permission to write in {existing}; name another --out")
+    return path
+
+
+def writable_file(path: str | os.PathLike) -> Path:
+    """Checks, without making it, that ``path`` can become a file, so that long work does not end in vain.
+
+    Raises:
+      InputError: it cannot.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a directory; expected the name of a file to write; add a name to --out")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: there is no directory {path.parent}; make it or name another --out")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: no permission to write in {path.parent}; name another --out")
     return path
