@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
 
 from mjx_refine.cli.types import FiniteFloat, Size
+from mjx_refine.errors import InputError
 
 _PATH = click.Path(path_type=Path)
 BACKENDS = ("auto", "mjx", "warp", "mujoco")
@@ -48,16 +51,20 @@ def app(context: click.Context, init, video, out, resume, **options) -> None:
 
 
 def _refine(init: Path, video: Path, out: Path, resume: bool, options: dict) -> None:
-    from mjx_refine.cli.display import display
-    from mjx_refine.files import writable_directory
+    from mjx_refine.files import remove_stale_parts, writable_directory
     from mjx_refine.observation import load_observation
-    from mjx_refine.report import write_result
     from mjx_refine.scene import load_scenes
-    from mjx_refine.search import Options, refine
 
     writable_directory(out)
     samples = load_scenes(init)
     observation = load_observation(video)
+
+    # Importing JAX takes seconds; bad input is told before.
+    from mjx_refine.cli.display import display
+    from mjx_refine.report import write_result
+    from mjx_refine.search import Options, refine
+
+    remove_stale_parts(out)
     for problem in samples.problems:
         click.echo(f"refine: left out: {problem.reason}", err=True)
     progress = display()
@@ -74,6 +81,16 @@ def _refine(init: Path, video: Path, out: Path, resume: bool, options: dict) -> 
     )
 
 
+@contextlib.contextmanager
+def _about(path: Path) -> Iterator[None]:
+    """Names the file in errors on what was read from it."""
+    try:
+        yield
+    except InputError as error:
+        message = str(error).removeprefix("<scene>: ")
+        raise error if message.startswith(str(path)) else InputError(f"{path}: {message}") from error
+
+
 @app.command()
 @click.argument("scene", type=_PATH)
 @click.option("--out", type=_PATH, required=True, help="Where to write flows.npz.")
@@ -82,11 +99,16 @@ def _refine(init: Path, video: Path, out: Path, resume: bool, options: dict) -> 
 @click.option("--fps", type=FiniteFloat(0.1, 1e5), default=30.0, help="Frames a second.")
 def simulate(scene: Path, out: Path, size, frames: int, fps: float) -> None:
     """Simulates a scene and writes its masks and exact flow."""
+    from mjx_refine.files import writable_file
     from mjx_refine.observation import save_observation
     from mjx_refine.scene import load_scene
     from mjx_refine.simulate import simulate as run
 
-    save_observation(out, run(load_scene(scene), size=size, frames=frames, fps=fps))
+    writable_file(out)
+    given = load_scene(scene)
+    with _about(scene):
+        observation = run(given, size=size, frames=frames, fps=fps)
+    save_observation(out, observation)
     click.echo(f"{out}: {frames} frames of {size[0]}x{size[1]} at {fps:g} fps")
 
 
@@ -115,11 +137,17 @@ def observe(clip: Path, out: Path, fps, start: float, end, stride: int, size, ma
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, help="Of everything random.")
 def guess(video: Path, out: Path, samples: int, seed: int) -> None:
     """Makes starting samples from an observation alone, without a language model."""
-    from mjx_refine.guess import guess_scenes
+    from mjx_refine.files import writable_file
     from mjx_refine.observation import load_observation
     from mjx_refine.scene import save_scenes
 
-    scenes = guess_scenes(load_observation(video), samples, seed)
+    writable_file(out)
+    observation = load_observation(video)
+
+    from mjx_refine.guess import guess_scenes
+
+    with _about(video):
+        scenes = guess_scenes(observation, samples, seed)
     save_scenes(out, scenes)
     click.echo(f"{out}: {len(scenes)} samples, the most likely first")
 
@@ -131,9 +159,13 @@ def guess(video: Path, out: Path, samples: int, seed: int) -> None:
 def export(scene: Path, out: Path, fps: float) -> None:
     """Writes a scene as MuJoCo XML with a keyframe, for `python -m mujoco.viewer --mjcf=scene.xml`."""
     from mjx_refine.export import save_export
+    from mjx_refine.files import writable_file
     from mjx_refine.scene import load_scene
 
-    save_export(out, load_scene(scene), fps)
+    writable_file(out)
+    given = load_scene(scene)
+    with _about(scene):
+        save_export(out, given, fps)
     click.echo(f"{out}: play it with `python -m mujoco.viewer --mjcf={out}` (load key 0 for the velocities)")
 
 
@@ -143,12 +175,16 @@ def export(scene: Path, out: Path, fps: float) -> None:
 @click.option("--truth", type=_PATH, help="The true scene, to compare parameters with.")
 def evaluate(scene: Path, video: Path, truth) -> None:
     """Scores a scene against an observation, and against the true scene; prints JSON."""
-    from mjx_refine.evaluate import compare_scenes, evaluate_scene
     from mjx_refine.observation import load_observation
     from mjx_refine.scene import load_scene
 
-    judged = load_scene(scene)
-    report = evaluate_scene(judged, load_observation(video))
-    if truth is not None:
-        report["truth"] = compare_scenes(judged, load_scene(truth), str(truth))
+    judged, observation = load_scene(scene), load_observation(video)
+    true = None if truth is None else load_scene(truth)
+
+    from mjx_refine.evaluate import compare_scenes, evaluate_scene
+
+    with _about(scene):
+        report = evaluate_scene(judged, observation)
+    if true is not None:
+        report["truth"] = compare_scenes(judged, true, str(truth))
     click.echo(json.dumps(report, indent=1))

@@ -37,7 +37,9 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 def _complain(message: str, status: int) -> int:
-    print("refine: " + " ".join(message.split()), file=sys.stderr)
+    line = " ".join(message.split())
+    # A file's name may hold control characters, which a terminal would obey.
+    print("refine: " + "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line), file=sys.stderr)
     return status
 
 
