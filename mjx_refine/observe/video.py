@@ -14,6 +14,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from mjx_refine.errors import InputError
 
+# FFmpeg prints lines of its own about a bad file; it asks for this once, when OpenCV first opens a video.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
 # The background model looks at so many pixels at most (frames x height x width): it bounds time and memory.
 _CONTEXT_PIXELS = 25_000_000
 _MOST_CONTEXT = 120
