@@ -82,30 +82,32 @@ def geom_size(body: Body) -> tuple[float, float, float]:
 
 
 def batch_from_scenes(scenes: list[Scene]) -> SceneBatch:
-    """Scenes of one kind as a batch."""
+    """Scenes of one kind as a batch.
+
+    Raises:
+      ValueError: no scene, or the scenes' kinds differ.
+    """
+    if not scenes or any(scene.shapes != scenes[0].shapes for scene in scenes):
+        raise ValueError(f"scene kinds {[s.shapes for s in scenes]}; expected at least one, all with the same shapes")
 
     def rows(value) -> np.ndarray:
         return np.array([[value(body) for body in scene.objects] for scene in scenes], np.float64)
 
-    return concatenate(
-        [
-            SceneBatch(
-                shapes=scenes[0].shapes if len({s.shapes for s in scenes}) == 1 else (),
-                size=rows(geom_size),
-                mass=rows(lambda b: b.mass),
-                friction=rows(lambda b: b.friction),
-                damping=rows(lambda b: b.damping),
-                stiffness=rows(lambda b: b.stiffness),
-                position=rows(lambda b: b.position),
-                quaternion=rows(lambda b: b.orientation),
-                linear_velocity=rows(lambda b: b.linear_velocity),
-                angular_velocity=rows(lambda b: b.angular_velocity),
-                gravity=np.array([s.gravity for s in scenes], np.float64),
-                camera_position=np.array([s.camera.position for s in scenes], np.float64),
-                camera_pitch=np.deg2rad([s.camera.orientation for s in scenes]),
-                camera_fovy=np.deg2rad([s.camera.fovy for s in scenes]),
-            )
-        ]
+    return SceneBatch(
+        shapes=scenes[0].shapes,
+        size=rows(geom_size),
+        mass=rows(lambda b: b.mass),
+        friction=rows(lambda b: b.friction),
+        damping=rows(lambda b: b.damping),
+        stiffness=rows(lambda b: b.stiffness),
+        position=rows(lambda b: b.position),
+        quaternion=rows(lambda b: b.orientation),
+        linear_velocity=rows(lambda b: b.linear_velocity),
+        angular_velocity=rows(lambda b: b.angular_velocity),
+        gravity=np.array([s.gravity for s in scenes], np.float64),
+        camera_position=np.array([s.camera.position for s in scenes], np.float64),
+        camera_pitch=np.deg2rad([s.camera.orientation for s in scenes]),
+        camera_fovy=np.deg2rad([s.camera.fovy for s in scenes]),
     )
 
 
