@@ -21,12 +21,14 @@ class Space:
     Attributes:
       scene: the start; whatever is no parameter stays as it is there.
       parameters: the coordinates of the unit box, in order.
-      fixed: (name, reason) of what is held at its start.
+      fixed: (name, reason) of what does not vary.
+      held: former parameters and their values, which need not be those of the scene.
     """
 
     scene: Scene
     parameters: tuple[Parameter, ...]
     fixed: tuple[tuple[str, str], ...] = ()
+    held: tuple[tuple[Parameter, float], ...] = ()
 
     @classmethod
     def around(cls, scene: Scene) -> Space:
@@ -65,16 +67,21 @@ class Space:
         return np.array([p.sigma for p in self.parameters])
 
     def freeze(self, held: Bool[np.ndarray, "dimension"], at: Float[np.ndarray, "dimension"], reason: str) -> Space:
-        """The space without the ``held`` coordinates, which keep their values ``at``."""
+        """The space without the ``held`` coordinates, which keep their values ``at``; the others mean what they meant.
+
+        Raises:
+          ValueError: ``held`` or ``at`` has the wrong shape, or ``at`` lies outside of the box.
+        """
         if held.shape != (self.dimension,):
             raise ValueError(f"held has shape {held.shape}; expected ({self.dimension},)")
         values = self.values(at)
-        parameters = tuple(p for p, h in zip(self.parameters, held, strict=True) if not h)
-        fixed = [(p.name, reason) for p, h in zip(self.parameters, held, strict=True) if h]
-        # The decoder starts from the scene, so that the held values must be in it.
-        base = dataclasses.replace(self, parameters=tuple(p for p, h in zip(self.parameters, held, strict=True) if h))
-        scene = base.scene_at(np.array([p.to_unit(v) for p, v in zip(base.parameters, values[held], strict=True)]))
-        return Space(scene, parameters, (*self.fixed, *fixed))
+        rows = list(zip(self.parameters, values.tolist(), held, strict=True))
+        return dataclasses.replace(
+            self,
+            parameters=tuple(p for p, _, h in rows if not h),
+            fixed=(*self.fixed, *((p.name, reason) for p, _, h in rows if h)),
+            held=(*self.held, *((p, value) for p, value, h in rows if h)),
+        )
 
     def values(self, u: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
         """Physical values at one point of the unit box."""
@@ -102,10 +109,11 @@ class Space:
         count = len(u)
         base = batch_from_scenes([self.scene]).map(lambda a: np.repeat(a, count, 0))
         raw = self._intermediate(base)
-        for j, parameter in enumerate(self.parameters):
+        columns = [(p, p.from_unit(u[:, j])) for j, p in enumerate(self.parameters)]
+        for parameter, value in (*self.held, *columns):
             i, k = parameter.index
             target = raw[parameter.field]
-            target[(slice(None), k) if i < 0 else (slice(None), i, k)] = parameter.from_unit(u[:, j])
+            target[(slice(None), k) if i < 0 else (slice(None), i, k)] = value
         return self._assemble(base, raw)
 
     def _intermediate(self, base: SceneBatch) -> dict[str, np.ndarray]:
