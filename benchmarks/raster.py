@@ -290,9 +290,8 @@ def machine() -> str:
 
 def table(name: str, compared: list[Compared], with_flow: bool) -> bool:
     """Prints one comparison; returns whether it meets what is required."""
-    print(
-        f"\n{name}; worst and median of those with 100 pixels and more\n{'shape':<10} {'objects':>7} {'pixels':>10} {'median IoU':>11} {'worst':>8} {'pooled':>9}"
-    )
+    print(f"\n{name}; worst and median of those with 100 pixels and more")
+    print(f"{'shape':<10} {'objects':>7} {'pixels':>10} {'median IoU':>11} {'worst':>8} {'pooled':>9}")
     for shape in SHAPES:
         counts = [
             c for one in compared for s, c in zip(one.shapes, one.counts, strict=True) if s == shape and c[1] > 99

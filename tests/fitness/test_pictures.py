@@ -87,13 +87,13 @@ def test_flow_that_was_never_measured():
 def test_an_interval_without_flow_is_left_out_of_the_mean():
     masks, seen = square({1: TOP_LEFT}, 3), still(3)
     seen[1] = np.nan
-    assert score_pictures(masks, still(3) + [3.0, 4.0], masks, seen, (1,)).epe[0] == pytest.approx(5.0)
+    assert score_pictures(masks, still(3) + np.array([3.0, 4.0]), masks, seen, (1,)).epe[0] == pytest.approx(5.0)
 
 
 def test_weights_enter_as_documented():
     simulated, observed = square({1: TOP_LEFT, 2: BOTTOM}), square({7: SHIFTED, 5: BOTTOM})
     weights = Weights(iou=0.3, epe=0.7, instance=2.0, object_epe=0.11)
-    scores = score_pictures(simulated, still() + [0.6, 0.8], observed, still(), (7, 5), weights)
+    scores = score_pictures(simulated, still() + np.array([0.6, 0.8]), observed, still(), (7, 5), weights)
     expected = 0.3 * 10 / 14 - 0.7 * 1.0 + 2.0 * 0.75 - 0.11 * 1.0
     assert scores.fitness[0] == pytest.approx(expected)
 
