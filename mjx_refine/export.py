@@ -58,23 +58,21 @@ def export_xml(scene: Scene, fps: float = 30.0) -> str:
     root = ElementTree.Element("mujoco", model="scene")
     root.append(ElementTree.Comment(_COMMENT))
     option = {"integrator": "Euler", "solver": "Newton", "cone": "elliptic"}
-    ElementTree.SubElement(
-        root, "option", timestep=repr(1.0 / (fps * SUBSTEPS)), gravity=_numbers(fields.gravity[0]), **option
-    )
+    _add(root, "option", timestep=repr(1.0 / (fps * SUBSTEPS)), gravity=_numbers(fields.gravity[0]), **option)
     _looks(root, scene)
-    world = ElementTree.SubElement(root, "worldbody")
+    world = _add(root, "worldbody")
     _surroundings(world, scene.camera)
     for i, (name, body) in enumerate(zip(names, scene.objects, strict=True)):
         place = {"pos": _numbers(body.position), "quat": _numbers(body.orientation)}
-        element = ElementTree.SubElement(world, "body", name=name, **place)
-        ElementTree.SubElement(element, "freejoint", name=name)
+        element = _add(world, "body", name=name, **place)
+        _add(element, "freejoint", name=name)
         inertia = {"mass": repr(float(fields.body_mass[0, i])), "diaginertia": _numbers(fields.body_inertia[0, i])}
-        ElementTree.SubElement(element, "inertial", pos="0 0 0", **inertia)
+        _add(element, "inertial", pos="0 0 0", **inertia)
         used = {"sphere": 1, "cylinder": 2, "box": 3}[body.shape]
         shape = {"type": body.shape, "size": _numbers(fields.geom_size[0, i, :used])}
         colour = f"{_COLOURS[i % len(_COLOURS)]} 1"
-        ElementTree.SubElement(element, "geom", name=name, **shape, rgba=colour, contype="0", conaffinity="0")
-    contact = ElementTree.SubElement(root, "contact")
+        _add(element, "geom", name=name, **shape, rgba=colour, contype="0", conaffinity="0")
+    contact = _add(root, "contact")
     for k, (first, second) in enumerate(contact_pairs(len(names))):
         numbers = {
             "friction": fields.pair_friction[0, k],
@@ -83,10 +81,10 @@ def export_xml(scene: Scene, fps: float = 30.0) -> str:
         }
         one = "floor" if first < 0 else names[first]
         texts = {key: _numbers(value) for key, value in numbers.items()}
-        ElementTree.SubElement(contact, "pair", geom1=one, geom2=names[second], condim="6", **texts)
+        _add(contact, "pair", geom1=one, geom2=names[second], condim="6", **texts)
     qpos, qvel = initial_state(batch)
-    keys = ElementTree.SubElement(root, "keyframe")
-    ElementTree.SubElement(keys, "key", name=KEYFRAME, qpos=_numbers(qpos[0]), qvel=_numbers(qvel[0]))
+    keys = _add(root, "keyframe")
+    _add(keys, "key", name=KEYFRAME, qpos=_numbers(qpos[0]), qvel=_numbers(qvel[0]))
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -98,6 +96,10 @@ def save_export(path: str | os.PathLike, scene: Scene, fps: float = 30.0) -> Pat
       InputError: as ``export_xml``, or the place cannot be written.
     """
     return files.write_text(path, export_xml(scene, fps))
+
+
+def _add(parent: ElementTree.Element, tag: str, /, **attributes: str) -> ElementTree.Element:
+    return ElementTree.SubElement(parent, tag, attributes)
 
 
 def _numbers(values) -> str:
@@ -123,26 +125,26 @@ def _looks(root: ElementTree.Element, scene: Scene) -> None:
     middle = np.mean([body.position for body in scene.objects], axis=0)
     distance = max(float(forward @ (middle - eye)), 0.5)
     # mjv_defaultFreeCamera: 1.5 extents from the centre.
-    ElementTree.SubElement(root, "statistic", center=_numbers(eye + distance * forward), extent=repr(distance / 1.5))
-    visual = ElementTree.SubElement(root, "visual")
+    _add(root, "statistic", center=_numbers(eye + distance * forward), extent=repr(distance / 1.5))
+    visual = _add(root, "visual")
     view = {"fovy": repr(scene.camera.fovy), "azimuth": "90", "elevation": repr(scene.camera.orientation - 90.0)}
-    ElementTree.SubElement(visual, "global", **view, offwidth="1280", offheight="960")
-    ElementTree.SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.3 0.3 0.3", specular="0 0 0")
-    asset = ElementTree.SubElement(root, "asset")
+    _add(visual, "global", **view, offwidth="1280", offheight="960")
+    _add(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.3 0.3 0.3", specular="0 0 0")
+    asset = _add(root, "asset")
     sky = {"type": "skybox", "builtin": "gradient", "rgb1": "0.75 0.8 0.85", "rgb2": "0.3 0.35 0.4"}
-    ElementTree.SubElement(asset, "texture", name="sky", **sky, width="256", height="256")
+    _add(asset, "texture", name="sky", **sky, width="256", height="256")
     check = {"type": "2d", "builtin": "checker", "rgb1": "0.62 0.62 0.6", "rgb2": "0.54 0.54 0.52"}
-    ElementTree.SubElement(asset, "texture", name="floor", **check, width="256", height="256")
+    _add(asset, "texture", name="floor", **check, width="256", height="256")
     cover = {"texture": "floor", "texrepeat": "2 2", "texuniform": "true", "reflectance": "0.05"}
-    ElementTree.SubElement(asset, "material", name="floor", **cover)
+    _add(asset, "material", name="floor", **cover)
 
 
 def _surroundings(world: ElementTree.Element, camera: Camera) -> None:
     """Light, floor and the scene's camera."""
-    ElementTree.SubElement(world, "light", pos="-1 -2 6", dir="0.15 0.3 -1", directional="true", diffuse="0.6 0.6 0.6")
+    _add(world, "light", pos="-1 -2 6", dir="0.15 0.3 -1", directional="true", diffuse="0.6 0.6 0.6")
     floor = {"type": "plane", "size": "0 0 0.05", "material": "floor", "contype": "0", "conaffinity": "0"}
-    ElementTree.SubElement(world, "geom", name="floor", **floor)
+    _add(world, "geom", name="floor", **floor)
     half = math.radians(camera.orientation) / 2
     turn = (math.cos(half), math.sin(half), 0.0, 0.0)
     place = {"pos": _numbers(camera.position), "quat": _numbers(turn), "fovy": repr(camera.fovy)}
-    ElementTree.SubElement(world, "camera", name="camera", mode="fixed", **place)
+    _add(world, "camera", name="camera", mode="fixed", **place)

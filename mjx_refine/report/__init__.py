@@ -1,0 +1,5 @@
+"""What a refinement leaves in its folder: scene, numbers, report and animation."""
+
+from mjx_refine.report.files import write_result
+
+__all__ = ["write_result"]
