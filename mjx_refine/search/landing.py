@@ -23,9 +23,6 @@ from mjx_refine.view.points import point_flow
 DAMPINGS = np.array([1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0])
 """Multiples of the prior's curvature that one line search tries."""
 
-HOPS = 2
-"""Attempts at each horizon to find a better basin for objects that do not fit."""
-
 SCATTER = 256
 """Points that one attempt draws."""
 
@@ -180,9 +177,20 @@ class LeastSquares:
         return self.evaluations + self.space.dimension + 2 * len(DAMPINGS) > self.limit
 
     def run(
-        self, start: np.ndarray, schedule: list[Stage], progress: Callable[[Stage, np.ndarray], None] | None = None
+        self,
+        start: np.ndarray,
+        schedule: list[Stage],
+        hops: int = 0,
+        progress: Callable[[Stage, np.ndarray], None] | None = None,
     ) -> Landing:
-        """Goes through the stages from ``start``."""
+        """Goes through the stages from ``start``.
+
+        Args:
+          start: in the unit box.
+          schedule: horizons, in order.
+          hops: attempts at each horizon to find a better basin for objects that do not fit.
+          progress: called after each stage.
+        """
         before = self.evaluations
         generator = np.random.default_rng(self.seed)
         point, jacobian, cost = start, np.zeros((0, len(start))), np.inf
@@ -190,7 +198,7 @@ class LeastSquares:
             if self._spent:
                 break
             if stage.frames > 1 and len(jacobian):
-                point, cost, jacobian = self._extend(point, jacobian, stage, generator)
+                point, cost, jacobian = self._extend(point, jacobian, stage, hops, generator)
             else:
                 point, cost, jacobian = self._stage(point, stage)
             if progress:
@@ -205,7 +213,7 @@ class LeastSquares:
             evaluations=self.evaluations - before,
         )
 
-    def _extend(self, point, jacobian, stage: Stage, generator):
+    def _extend(self, point, jacobian, stage: Stage, hops: int, generator):
         """Least squares at a longer horizon, from several points that the shorter one leaves open.
 
         A single picture does not tell how far away, hence how large, an object in the air is, nor what the next contact
@@ -213,7 +221,7 @@ class LeastSquares:
         of each: the best draw of every object that does not fit is combined into one point.
         """
         best = self._stage(point, stage)
-        for _ in range(HOPS):
+        for _ in range(hops):
             misfit = self._misfit(best[0], stage)
             if not misfit.any() or self._spent:
                 break

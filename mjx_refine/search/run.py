@@ -24,14 +24,18 @@ from mjx_refine.space import Space
 SEARCH_WIDTH = 160
 """Samples across a picture during the search, by default."""
 
-LANDED_WELL = 0.85
-"""IoU above which no further sample is tried as a start of least squares."""
+LANDED_WELL = 0.93
+"""IoU above which nothing more is tried before the population search."""
 
-LANDING_SHARE = 0.5
+LANDING_SHARE = 0.6
 """Part of the budget that least squares may spend before the population search (``hybrid``)."""
 
-INFLATION = 25.0
-"""Factor on the noise variance when the population starts from a landing: pictures and outlines disagree a little."""
+NARROWING = 0.25
+"""Factor on the landing's covariance for the first generation."""
+
+PRIOR_LEFT = 0.05
+"""Prior widths that the first generation may spread where the landing left a parameter open. More, and contacts beyond
+those that were landed on spoil almost every candidate of it."""
 
 ELITES = 8
 """Candidates of the search that are compared at full resolution in the end."""
@@ -149,20 +153,26 @@ class Run:
     # Land ---------------------------------------------------------------------------------------------------------
 
     def _land(self) -> None:
+        """Lands from the best samples; where none lands well, again from the best of them with more attempts at each
+        contact, then from further samples."""
         share = LANDING_SHARE if self.options.optimizer == "hybrid" else 1.0
         limit = int(share * self.options.budget)
-        starts = self.problem.starts
-        while len(self.landed) < len(starts):
-            tried = len(self.landed)
-            enough = tried >= self.options.starts
-            if enough and (tried >= 3 * self.options.starts or max(r.iou for r in self.landed) >= LANDED_WELL):
+        plan = [(rank, 0) for rank in range(self.options.starts)]
+        plan += [(-1, 2)] + [(rank, 0) for rank in range(self.options.starts, 3 * self.options.starts)] + [(-1, 2)]
+        for step, (rank, hops) in enumerate(plan):
+            if step < len(self.landed) or rank >= len(self.problem.starts):
+                continue
+            done = max((r.iou for r in self.landed), default=0.0)
+            if step >= self.options.starts and done >= LANDED_WELL:
                 break
-            if tried and self.evaluations * (tried + 1) / tried > limit:
+            if self.landed and self.evaluations + self.evaluations / len(self.landed) > limit:
                 break
-            self.landed.append(self._land_one(tried, limit - self.evaluations))
+            if rank < 0:
+                rank = max(self.landed, key=lambda landed: landed.fitness).rank
+            self.landed.append(self._land_one(rank, limit - self.evaluations, hops))
             self._save(force=True)
 
-    def _land_one(self, rank: int, limit: int) -> Landed:
+    def _land_one(self, rank: int, limit: int, hops: int) -> Landed:
         start = self.problem.starts[rank]
         space = Space.around(start.scene)
         reference = self.problem.reference(start.scene.shapes)
@@ -176,11 +186,12 @@ class Run:
             costs, scores = objective(point[None])
             self._step("land", -float(costs[0]), scores, float(stage.frames))
 
-        landing = squares.run(space.start, stages(self.problem.observation.length), show)
+        landing = squares.run(space.start, stages(self.problem.observation.length), hops, show)
         self.evaluations = before + landing.evaluations
         scores = self.problem.score([space.scene_at(landing.point)], start.matching)
         curvature = np.linalg.inv(landing.covariance * (1 / np.outer(space.sigma, space.sigma)))
-        loose = (curvature - np.eye(len(curvature))) / INFLATION + np.eye(len(curvature))
+        seen = curvature - np.eye(len(curvature))
+        loose = seen / NARROWING + np.eye(len(curvature)) / PRIOR_LEFT**2
         covariance = np.linalg.inv(loose) * np.outer(space.sigma, space.sigma)
         return Landed(
             rank, landing.point, (covariance + covariance.T) / 2, float(scores.fitness[0]), float(scores.iou[0])
@@ -297,8 +308,8 @@ class Run:
             "searching": self._saved is not None,
         }
         arrays = {}
-        for r in self.landed:
-            arrays[f"landed.{r.rank}.point"], arrays[f"landed.{r.rank}.covariance"] = r.point, r.covariance
+        for k, r in enumerate(self.landed):
+            arrays[f"landed.{k}.point"], arrays[f"landed.{k}.covariance"] = r.point, r.covariance
         if self._saved is not None:
             values.update(self._saved[0])
             arrays.update(self._saved[1])
@@ -312,8 +323,8 @@ class Run:
         values, arrays = loaded
         self.evaluations, self.before = values["evaluations"], values["seconds"]
         self.history = [Step(*row) for row in values["history"]]
-        for rank, fitness, iou in values["landed"]:
-            point, covariance = arrays[f"landed.{rank}.point"], arrays[f"landed.{rank}.covariance"]
+        for k, (rank, fitness, iou) in enumerate(values["landed"]):
+            point, covariance = arrays[f"landed.{k}.point"], arrays[f"landed.{k}.covariance"]
             self.landed.append(Landed(rank, point, covariance, fitness, iou))
         if values["searching"]:
             fitness, iou, epe = values["best"]
