@@ -158,7 +158,7 @@ def make_observation(
         raise InputError(f"{source}: frames of {width}x{height}; expected at least 8x8 pixels")
     if np.isinf(flow).any():
         raise InputError(f"{source}: flow holds infinities; expected finite numbers, or NaN where it was not measured")
-    if (np.abs(flow) > MAX_FLOW).any():
+    if flow.dtype.itemsize > 2 and (np.abs(flow) > MAX_FLOW).any():  # float16 ends below
         raise InputError(
             f"{source}: flow holds displacements of {np.nanmax(np.abs(flow)):.3g} px/frame; expected at most {MAX_FLOW:g}; "
             "write NaN where it was not measured"
