@@ -94,4 +94,6 @@ def text(value: object, place: str) -> str:
         value = str(value)
     if not isinstance(value, str) or not value.strip() or len(value) > 200 or not value.isprintable():
         raise InputError(f"{place} = {show(value)}; expected a printable text of 1 to 200 characters")
+    if "<answer>" in value or "<think>" in value:
+        raise InputError(f"{place} = {show(value)}; expected a text without <answer> and <think>; rename it")
     return value.strip()

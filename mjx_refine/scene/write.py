@@ -69,7 +69,7 @@ _Dumper.add_representer(list, _Dumper.represent_list_inline)
 
 def dump_scene(scene: Scene) -> str:
     """The scene as YAML text; numbers keep every digit."""
-    return yaml.dump(scene_entries(scene), Dumper=_Dumper, sort_keys=False, width=200, allow_unicode=True)
+    return yaml.dump(scene_entries(scene), Dumper=_Dumper, sort_keys=False, width=4096, allow_unicode=True)
 
 
 def save_scene(path: str | os.PathLike, scene: Scene) -> Path:
