@@ -1,6 +1,7 @@
 """Real clips: from a video file to an observation."""
 
-from mjx_refine.observe.clip import ObjectReport, ObserveReport, ObserveResult, observe_clip, observe_command
+from mjx_refine.observe.clip import ObjectReport, ObserveReport, ObserveResult, observe_clip
+from mjx_refine.observe.command import observe_command
 from mjx_refine.observe.preview import flow_colours, preview, write_preview, write_result
 
 __all__ = [
