@@ -124,19 +124,23 @@ def holds_camera(scene: Scene) -> bool:
     return False
 
 
+def random_scene(shapes: tuple[Shape, ...], generator: np.random.Generator, aspect: float = 1.5) -> Scene:
+    """A scene of these shapes that does not enclose its camera; ``aspect`` is the picture's width over its height."""
+    while True:
+        camera = random_camera(generator)
+        bodies = (random_body(shape, i, camera, aspect, generator) for i, shape in enumerate(shapes))
+        scene = Scene(tuple(bodies), camera)
+        if not holds_camera(scene):
+            return scene
+
+
 def random_scenes(count: int, seed: int, aspect: float = 1.5) -> Iterator[Scene]:
     """``count`` scenes for each shape: a body of that shape and none to three others."""
     generator = np.random.default_rng(seed)
     for shape in SHAPES:
-        made = 0
-        while made < count:
-            camera = random_camera(generator)
-            others = generator.choice(SHAPES, generator.integers(0, 4))
-            shapes = (shape, *map(str, others))
-            scene = Scene(tuple(random_body(s, i, camera, aspect, generator) for i, s in enumerate(shapes)), camera)
-            if not holds_camera(scene):
-                made += 1
-                yield scene
+        for _ in range(count):
+            others = [SHAPES[i] for i in generator.integers(0, len(SHAPES), generator.integers(0, 4))]
+            yield random_scene((shape, *others), generator, aspect)
 
 
 def moved_poses(batch: SceneBatch, generator: np.random.Generator) -> Float[np.ndarray, "2 objects 7"]:
