@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_refine.sim.colliders.hook import Geom, Points
+from mjx_refine.sim.colliders.contact import Geom, Points
 
 POINTS = 8
 """Corners of a quadrilateral cut by a rectangle, at most."""

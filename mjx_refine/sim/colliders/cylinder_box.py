@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjx_refine.sim.colliders.contact import Geom, Points
 from mjx_refine.sim.colliders.directions import closest_on_lines, least_on_circle, towards, unit
-from mjx_refine.sim.colliders.hook import Geom, Points
 
 ALIGNED = float(np.cos(0.0889))
 SQUARE = float(np.sin(0.0889))

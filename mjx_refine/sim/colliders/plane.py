@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_refine.sim.colliders.hook import Geom, Points
+from mjx_refine.sim.colliders.contact import Geom, Points
 
 _CORNERS = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], np.float32)
 

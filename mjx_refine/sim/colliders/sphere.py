@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjx_refine.sim.colliders.hook import Geom, Points
+from mjx_refine.sim.colliders.contact import Geom, Points
 
 
 def _safe_norm(vector: Float[Array, "3"]) -> Float[Array, ""]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from mjx_refine.sim.colliders.box_box import POINTS, box_box
+from mjx_refine.sim.colliders.contact import GeomType, as_mjx
 from mjx_refine.sim.colliders.cylinder_box import cylinder_box
 from mjx_refine.sim.colliders.cylinder_cylinder import cylinder_cylinder
-from mjx_refine.sim.colliders.hook import GeomType, as_mjx
 from mjx_refine.sim.colliders.plane import plane_box, plane_cylinder
 from mjx_refine.sim.colliders.sphere import sphere_box, sphere_cylinder
 
