@@ -21,8 +21,14 @@ from mjx_refine.space import Space
 FITTED = 8
 """Hypotheses, of different families, that a short least squares improves."""
 
-ROLLOUTS = 2400
+ROLLOUTS = 6000
 """Rollouts times objects that all those fits may take together."""
+
+KINDS = 5
+"""Scene kinds among the samples: whoever refines them compiles a program for each."""
+
+DRAWS = 128
+"""Points tried around a hypothesis whose objects hit something."""
 
 LEFT = 0.15
 """Share of the samples kept for families that scored badly."""
@@ -62,7 +68,9 @@ def guess_scenes(observation: Observation, count: int = 32, seed: int = 0) -> li
     ranked = sorted(
         (_Ranked(float(s), h) for s, h in zip(scores, candidates, strict=True)), key=lambda r: -r.score
     )
-    fitted = _fit(ranked, judge, seen, clip, seed)
+    kinds = list(dict.fromkeys(r.hypothesis.scene.shapes for r in ranked))[:KINDS]
+    ranked = [r for r in ranked if r.hypothesis.scene.shapes in kinds]
+    fitted = _Fitter(judge, seen, seed)(ranked)
     return _chosen(fitted, ranked, judge, count, seed)
 
 
@@ -79,28 +87,58 @@ def _families(ranked: list[_Ranked]) -> list[_Ranked]:
     return list(best.values())
 
 
-def _fit(ranked: list[_Ranked], judge: Judge, seen: Outlines, clip: Clip, seed: int) -> list[_Ranked]:
-    """The best families after a few steps of least squares, where that helped."""
-    columns = tuple(seen.ids.index(track.id) for track in clip.tracks)
-    length = len(seen.support)
-    chosen = _spread(_families(ranked), FITTED)
-    limit = ROLLOUTS // (len(clip.tracks) * max(len(chosen), 1))
-    scenes = []
-    for r in chosen:
-        scene = r.hypothesis.scene
+class _Fitter:
+    """Least squares on outlines, from hypotheses.
+
+    Args:
+      judge: of the results.
+      seen: the outlines.
+      seed: of the points tried around a hypothesis.
+    """
+
+    def __init__(self, judge: Judge, seen: Outlines, seed: int):
+        self.judge, self.seen, self.seed = judge, seen, seed
+        self.columns = tuple(seen.ids.index(track.id) for track in judge.tracks)
+
+    def __call__(self, ranked: list[_Ranked]) -> list[_Ranked]:
+        """The best of several families, improved; the most promising of them more than once, from other points."""
+        unit = ROLLOUTS // len(self.judge.tracks)
+        chosen = [self._improved(r, unit // 24) for r in _spread(_families(ranked), FITTED)]
+        for count, limit in ((4, unit // 12), (2, unit // 6)):
+            chosen.sort(key=lambda r: -r.score)
+            chosen[:count] = [self._improved(self._scattered(r), limit) for r in chosen[:count]]
+        return chosen
+
+    def _improved(self, r: _Ranked, limit: int) -> _Ranked:
+        """After least squares of at most about ``limit`` rollouts, or as it was where that does not help."""
+        scene, judge, length = r.hypothesis.scene, self.judge, len(self.seen.support)
         space = Space.around(scene)
         rollout = judge.simulator(scene.shapes).rollout
-        squares = LeastSquares(space, rollout, seen, columns, clip.size, limit=limit, seed=seed)
-        point = space.start
-        for stage in (Stage(max(2, length // 3), 12.0, 3), Stage(length, 12.0, 4), Stage(length, 4.0, 3)):
-            point = squares.run(point, [stage]).point
-        scenes.append(space.scene_at(point))
-    scores = judge(scenes)
-    return [
-        _Ranked(float(s), Hypothesis(scene, r.hypothesis.family))
-        for s, scene, r in zip(scores, scenes, chosen, strict=True)
-        if s > r.score
-    ]
+        squares = LeastSquares(space, rollout, self.seen, self.columns, judge.size, limit=limit, seed=self.seed)
+        points = [space.start]
+        for stage in (Stage(max(2, length // 3), 12.0, 3), Stage(length, 12.0, 4), Stage(length, 4.0, 4)):
+            points.append(squares.run(points[-1], [stage]).point)
+        scores = judge([space.scene_at(p) for p in points])
+        best = int(np.argmax(scores))
+        if scores[best] <= r.score:
+            return r
+        return _Ranked(float(scores[best]), Hypothesis(space.scene_at(points[best]), r.hypothesis.family))
+
+    def _scattered(self, r: _Ranked) -> _Ranked:
+        """The best of many points around it, in two rounds: what follows an impact is too jagged for derivatives."""
+        if all(len(track.pieces) == 1 for track in self.judge.tracks):
+            return r
+        space = Space.around(r.hypothesis.scene)
+        generator = np.random.default_rng(self.seed)
+        point, best = space.start, r.score
+        for widest in (0.4, 0.15):
+            widths = np.geomspace(0.01, widest, DRAWS)[:, None]
+            points = point + generator.standard_normal((DRAWS, space.dimension)) * widths * space.sigma
+            points = np.clip(points, 0.0, 1.0)
+            scores = self.judge.of_batch(space.decode(points))
+            if scores.max() > best:
+                point, best = points[int(np.argmax(scores))], float(scores.max())
+        return _Ranked(best, Hypothesis(space.scene_at(point), r.hypothesis.family))
 
 
 def _spread(families: list[_Ranked], count: int) -> list[_Ranked]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -17,6 +18,9 @@ from mjx_refine.space import rotations
 GRAVITY = 9.81
 BODY_SIZE = 0.15
 """Radius [m] that objects get where nothing tells the scale."""
+
+LOW_FRICTION = 0.2
+"""Friction that a larger gravity brings a strong loss of speed down to."""
 
 FOVY = 45.0
 
@@ -197,15 +201,16 @@ def _on_floor(clip: Clip, lens: Lens, most: int) -> list[Hypothesis]:
         camera = np.array([0.0, -math.tan(lens.pitch), 1.0])
         shift = np.array([camera[0], camera[1], 0.0])
         rolls = [False, True] if any(_can_roll(f) for f in forms) else [False]
-        for rolling in rolls:
-            placed = []
-            for p, motion in lifted:
-                moved = dataclasses.replace(p, position=p.position + shift)
-                placed.append(_slowed(moved, motion, scale, lens, rolling))
-            for bounce in (0.85, 0.5) if len(placed) > 1 else (0.5,):
-                scene = _scene(clip, lens, placed, camera, np.array([0.0, 0.0, -GRAVITY]), scale, bounce)
-                mode = "rolling" if rolling else "sliding"
-                result.append(Hypothesis(scene, (mode, round(math.degrees(lens.pitch)), scene.shapes)))
+        strongest = max(m.deceleration for _, m in lifted) * scale
+        # Strong friction between objects throws them up; a larger gravity slows them as well with less of it.
+        gravities = [GRAVITY, strongest / LOW_FRICTION] if strongest > 2 * LOW_FRICTION * GRAVITY else [GRAVITY]
+        bounces = (0.95, 0.7) if len(forms) > 1 else (0.6,)
+        for rolling, strength, bounce in itertools.product(rolls, gravities, bounces):
+            moved = [(dataclasses.replace(p, position=p.position + shift), m) for p, m in lifted]
+            placed = [_slowed(p, m, scale, strength, lens, rolling) for p, m in moved]
+            scene = _scene(clip, lens, placed, camera, np.array([0.0, 0.0, -strength]), scale, bounce)
+            mode = "rolling" if rolling else "sliding"
+            result.append(Hypothesis(scene, (mode, round(math.degrees(lens.pitch)), scene.shapes)))
     return result
 
 
@@ -216,9 +221,9 @@ def _can_roll(form: Form) -> bool:
     return form.shape == "cylinder" and abs(axis[2]) < 0.3
 
 
-def _slowed(p: Placed, motion: Motion, scale: float, lens: Lens, rolling: bool) -> Placed:
-    """With the friction that its loss of speed asks for."""
-    loss = max(motion.deceleration * scale / GRAVITY, 0.0)
+def _slowed(p: Placed, motion: Motion, scale: float, gravity: float, lens: Lens, rolling: bool) -> Placed:
+    """With the friction that its loss of speed asks for under ``gravity`` [m/s^2]."""
+    loss = max(motion.deceleration * scale / gravity, 0.0)
     if rolling and _can_roll(p.form):
         radius = p.form.size[0] * p.depth / lens.focal
         spin = np.array([-p.velocity[1], p.velocity[0], 0.0]) / radius
@@ -316,7 +321,7 @@ def _landing_scene(clip: Clip, lens: Lens, forms, flights, below: float) -> Scen
         position[2] = extent_below(form) * depth / lens.focal
         velocity = np.array([*motion.velocity[:2], 0.0])
         p = Placed(form, depth, position, velocity, _turning(track, lens, clip.fps))
-        placed.append(_slowed(p, motion, 1.0, lens, rolling=_can_roll(form)))
+        placed.append(_slowed(p, motion, 1.0, GRAVITY, lens, rolling=_can_roll(form)))
     middle = np.mean([p.position for p in placed], axis=0)
     shift = -np.array([middle[0], middle[1], 0.0])
     placed = [dataclasses.replace(p, position=p.position + shift) for p in placed]
@@ -369,14 +374,14 @@ def _from_side(clip: Clip, lens: Lens, most: int) -> list[Hypothesis]:
 
 def _side_scenes(clip: Clip, lens: Lens, lifted) -> list[Hypothesis]:
     moves = [motions(track, points, frames, clip.fps) for track, _, frames, points in lifted]
-    falling = [m.acceleration[2] for m, (t, *_) in zip(moves, lifted, strict=True) if _falls(t)]
-    pull = -float(np.median(falling)) if falling else 0.0
+    falling = [m.fall for m, (t, *_) in zip(moves, lifted, strict=True) if _falls(t)]
+    pull = float(np.median(falling)) if falling else 0.0
     unit = 1.0 / lens.focal
     bottoms = [points[:, 2].min() - extent_below(form) * unit for _, form, _, points in lifted]
     bounced = any(len(track.pieces) > 1 for track, *_ in lifted)
     radius = float(np.mean([np.mean(form.size) for _, form, *_ in lifted])) * unit
     lowest = min(bottoms)
-    margins = (0.0, 0.2 * radius) if bounced or pull <= 0 else (0.02 + radius,)
+    margins = (0.0, 0.3 * radius, 0.7 * radius) if bounced or pull <= 0 else (0.02 + radius,)
     result = []
     for margin in margins:
         floor = lowest - margin
@@ -387,20 +392,28 @@ def _side_scenes(clip: Clip, lens: Lens, lifted) -> list[Hypothesis]:
             velocity = np.array([velocity[0], 0.0, velocity[2] if pull > 0 else 0.0])
             centre = np.array([position[0], 0.0, position[2] - floor])
             placed.append(Placed(form, 1.0, centre, velocity, _turning(track, lens, clip.fps)))
-        typical = _scale(lens, placed)
-        scales = [typical] if pull <= 0 else [GRAVITY / pull, typical]
-        if pull > 0 and 0.6 < scales[0] / typical < 1.7:
-            scales = scales[:1]
-        for scale in scales:
-            if not 1e-2 < scale < 1e2:
-                continue
-            strength = pull * scale if pull > 0 else GRAVITY
-            objects = placed
-            if pull <= 0:
-                objects = [_slowed(p, m, scale, lens, True) for p, m in zip(placed, moves, strict=True)]
-            gravity = np.array([0.0, 0.0, -min(strength, 900.0)])
-            bounce = restitution(clip.tracks)
-            camera = np.array([0.0, -1.0, -floor])
-            scene = _scene(clip, lens, objects, camera, gravity, scale, bounce)
-            result.append(Hypothesis(scene, ("side", round(math.degrees(lens.pitch)), scene.shapes)))
+        for factor, bounce in itertools.product((0.94, 1.0, 1.06), (0.85, 1.0, 1.12)) if bounced else [(1.0, 1.0)]:
+            result += _side_variants(clip, lens, placed, moves, floor, pull * factor, bounce * restitution(clip.tracks))
+    return result
+
+
+def _side_variants(
+    clip: Clip, lens: Lens, placed: list[Placed], moves: list[Motion], floor: float, pull: float, bounce: float
+) -> list[Hypothesis]:
+    """With gravity as it is, and with objects of typical size; only the latter where nothing falls."""
+    typical = _scale(lens, placed)
+    scales = [typical] if pull <= 0 else [GRAVITY / pull, typical]
+    if pull > 0 and 0.6 < scales[0] / typical < 1.7:
+        scales = scales[:1]
+    result = []
+    for scale in scales:
+        if not 1e-2 < scale < 1e2:
+            continue
+        strength = pull * scale if pull > 0 else GRAVITY
+        objects = placed
+        if pull <= 0:
+            objects = [_slowed(p, m, scale, GRAVITY, lens, True) for p, m in zip(placed, moves, strict=True)]
+        gravity = np.array([0.0, 0.0, -min(strength, 900.0)])
+        scene = _scene(clip, lens, objects, np.array([0.0, -1.0, -floor]), gravity, scale, bounce)
+        result.append(Hypothesis(scene, ("side", round(math.degrees(lens.pitch)), scene.shapes)))
     return result

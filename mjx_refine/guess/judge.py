@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from mjx_refine.batch import batch_from_scenes
+from mjx_refine.batch import SceneBatch, batch_from_scenes
 from mjx_refine.guess.tracks import Track
 from mjx_refine.scene import Scene, Shape
 from mjx_refine.search.features import DIRECTIONS
@@ -50,11 +50,11 @@ class Judge:
         for rows in kinds.values():
             for k in range(0, len(rows), CHUNK):
                 part = rows[k : k + CHUNK]
-                scores[part] = self._score([scenes[row] for row in part])
+                scores[part] = self.of_batch(batch_from_scenes([scenes[row] for row in part]))
         return scores
 
-    def _score(self, scenes: list[Scene]) -> np.ndarray:
-        batch = batch_from_scenes(scenes)
+    def of_batch(self, batch: SceneBatch) -> Float[np.ndarray, "batch"]:
+        """Ditto for candidates of one kind."""
         poses = self.simulator(batch.shapes).rollout(batch, self.length)
         bad = ~np.isfinite(poses).all((1, 2, 3))
         poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)

@@ -19,6 +19,7 @@ class Motion:
       velocity: ditto [m/s].
       acceleration: mean over the smooth pieces [m/s^2].
       deceleration: mean loss of speed along the motion [m/s^2].
+      fall: median downward acceleration of the pieces that fall, the longer ones counting more [m/s^2].
       weight: how much the acceleration is worth: squared seconds of the pieces.
       points, seconds: of the first piece.
     """
@@ -27,6 +28,7 @@ class Motion:
     velocity: Float[np.ndarray, "3"]
     acceleration: Float[np.ndarray, "3"]
     deceleration: float
+    fall: float
     weight: float
     points: Float[np.ndarray, "piece 3"]
     seconds: Float[np.ndarray, "piece"]
@@ -60,13 +62,19 @@ def motions(track: Track, points: Float[np.ndarray, "seen 3"], frames: np.ndarra
     first = len(track.pieces[0].frames)
     curved = first >= 6
     start = _polynomial(seconds[:first], points[:first], 2 if curved else 1)
-    if track.late:
-        start = np.stack([points[0], np.zeros(3), np.zeros(3)])
+    piece = track.pieces[0]
+    travel = np.linalg.norm(piece.at(piece.frames[-1]) - piece.at(piece.frames[0]))
+    if track.late or (first > 2 and travel < 0.06 * track.diameter + 0.3):
+        start = np.stack([points[:first].mean(0), np.zeros(3), np.zeros(3)])
     total, acceleration, loss, moving = 0.0, np.zeros(3), 0.0, 0.0
+    falls: list[float] = []
     begin = 0
     for piece in track.pieces:
         part = slice(begin, begin + len(piece.frames))
         begin += len(piece.frames)
+        if len(piece.frames) >= 4:
+            change = _polynomial(seconds[part] - seconds[part].mean(), points[part], 2)[2]
+            falls += [-float(change[2])] * len(piece.frames) * bool(change[2] < 0)
         if len(piece.frames) < 5:
             continue
         middle = seconds[part].mean()
@@ -82,6 +90,7 @@ def motions(track: Track, points: Float[np.ndarray, "seen 3"], frames: np.ndarra
         velocity=start[1],
         acceleration=acceleration / max(total, 1e-12),
         deceleration=loss / max(moving, 1e-12),
+        fall=float(np.median(falls)) if falls else 0.0,
         weight=moving,
         points=points[:first],
         seconds=seconds[:first],
