@@ -9,6 +9,7 @@ import warnings
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -225,7 +226,7 @@ def save_observation(path: str | os.PathLike, observation: Observation) -> Path:
     """Writes ``flows.npz`` (flow as float16 where that loses less than 0.02 px), whole or not at all."""
     flow = observation.flow
     small = np.nanmax(np.abs(flow), initial=0.0) < 40.0
-    arrays: dict[str, np.ndarray] = {
+    arrays: dict[str, Any] = {
         "flow": flow.astype(np.float16 if small else np.float32),
         "fps": np.float64(observation.fps),
     }
@@ -235,4 +236,4 @@ def save_observation(path: str | os.PathLike, observation: Observation) -> Path:
         arrays["frames"] = observation.frames
     if observation.flow_sigma is not None:
         arrays["flow_sigma"] = np.asarray(observation.flow_sigma, np.float32)
-    return files.write_atomic(path, lambda stream: np.savez_compressed(stream, **arrays))  # type: ignore[arg-type]
+    return files.write_atomic(path, lambda stream: np.savez_compressed(stream, **arrays))

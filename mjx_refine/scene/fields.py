@@ -74,7 +74,7 @@ def number(
     return result + 0.0  # -0.0 becomes 0.0
 
 
-def vector(value: object, place: str, length: int, low: float = -1e6, high: float = 1e6, *, above: bool = False):
+def vector(value: object, place: str, length: int, low: float = -1e6, high: float = 1e6, *, above: bool = False) -> Any:
     """``value`` as a tuple of ``length`` numbers in [low, high]."""
     if isinstance(value, str | bytes) or not isinstance(value, Sequence) or len(value) != length:
         raise InputError(f"{place} = {show(value)}; expected a list of {length} numbers")

@@ -61,7 +61,7 @@ class MujocoSimulator:
             state[:, 1 : 1 + qpos.shape[1] + qvel.shape[1]] = np.concatenate([qpos, qvel], 1)
             steps = (frames - 1) * SUBSTEPS
             states, _ = rollout.rollout(models, self._data, state, nstep=steps)
-            later = states[:, SUBSTEPS - 1 :: SUBSTEPS, 1 : 1 + qpos.shape[1]]
+            later = np.asarray(states)[:, SUBSTEPS - 1 :: SUBSTEPS, 1 : 1 + qpos.shape[1]]
             first = np.concatenate([first, later], 1)
         poses = first.reshape(len(batch), frames, len(self.shapes), 7)
         bad = ~np.isfinite(poses).all((2, 3)) | (np.abs(poses[..., :3]) > 1e4).any((2, 3))

@@ -6,6 +6,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_refine.batch import SceneBatch
@@ -104,7 +105,9 @@ def make_frames(
     )
 
 
-def frames_of_batch(poses: Float[Array, "batch frames objects 7"], batch: SceneBatch, height_px: int) -> Frames:
+def frames_of_batch(
+    poses: Float[Array | np.ndarray, "batch frames objects 7"], batch: SceneBatch, height_px: int
+) -> Frames:
     """``make_frames`` with the camera and sizes of ``batch``, in float32."""
     arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
     return _make_frames(*(jnp.asarray(a, jnp.float32) for a in arrays), height_px)

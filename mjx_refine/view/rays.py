@@ -6,6 +6,8 @@ Rays start outside the objects; an object around the camera is not seen.
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -15,7 +17,7 @@ from mjx_refine.view.frames import Frames
 FAR = 1e9
 """Ray parameter of a miss."""
 
-_Vector = tuple[Array, Array, Array]
+_Vector = tuple[Array, ...]
 
 
 def _sphere(o: _Vector, d: _Vector, size: _Vector) -> Array:
@@ -33,12 +35,13 @@ def _safe(x: Array) -> Array:
 
 
 def _box(o: _Vector, d: _Vector, size: _Vector) -> Array:
-    near, far = None, None
+    nears, fars = [], []
     for oi, di, si in zip(o, d, size, strict=True):
         inverse = 1.0 / _safe(di)
         middle, half = -oi * inverse, si * jnp.abs(inverse)
-        near = middle - half if near is None else jnp.maximum(near, middle - half)
-        far = middle + half if far is None else jnp.minimum(far, middle + half)
+        nears.append(middle - half)
+        fars.append(middle + half)
+    near, far = functools.reduce(jnp.maximum, nears), functools.reduce(jnp.minimum, fars)
     return jnp.where((near < far) & (near > 0.0), near, FAR)
 
 

@@ -126,7 +126,7 @@ class TileScorer:
 
     def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Scores:
         """Scores of every candidate; a candidate whose poses are not finite has fitness -inf and IoU 0."""
-        bad = ~np.isfinite(poses).all((1, 2, 3))
+        bad = np.logical_not(np.isfinite(poses).all((1, 2, 3)))
         poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
         scores = scores_from_sums(self._sums(poses, batch), self.weights)
         fitness = np.where(bad, -np.inf, scores.fitness)
