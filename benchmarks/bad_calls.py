@@ -33,6 +33,10 @@ def _file(folder: Path) -> None:
     (folder / "taken").write_text("mine")
 
 
+def _in_the_way(folder: Path) -> None:
+    (folder / "out" / "result.json").mkdir(parents=True)
+
+
 def _folder(folder: Path) -> None:
     (folder / "taken").mkdir()
 
@@ -115,6 +119,7 @@ CALLS = [
     _call("--out under a file", [*_refine()[:4], "--out", "taken/a/b"], "taken", "name another", before=_file),
     _call("--out a symlink loop", [*_refine()[:4], "--out", "loop"], "loop", "name another", before=_loop),
     _call("--out of a long name", [*_refine()[:4], "--out", "n" * 300], "nnn", "long"),
+    _call("--out with a folder in a result's way", _refine(), r"out/result\.json", "name another", before=_in_the_way),
     _call("--seed -1", _refine("--seed", "-1"), "--seed", "0<=x"),
     _call("--seed pi", _refine("--seed", "pi"), "--seed", "'pi'"),
     _call("--population 1", _refine("--population", "1"), "--population", "4<=x"),

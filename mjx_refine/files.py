@@ -6,7 +6,7 @@ import contextlib
 import os
 import re
 import secrets
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -58,8 +58,8 @@ def remove_stale_parts(folder: str | os.PathLike) -> None:
                 file.unlink()
 
 
-def writable_directory(path: str | os.PathLike) -> Path:
-    """Checks, without making it, that ``path`` is or can become a directory to write in.
+def writable_directory(path: str | os.PathLike, names: Iterable[str] = ()) -> Path:
+    """Checks, without making it, that ``path`` is or can become a directory to write files called ``names`` in.
 
     Raises:
       InputError: it cannot.
@@ -78,6 +78,11 @@ def writable_directory(path: str | os.PathLike) -> Path:
         raise InputError(f"{path}: {existing} is no directory; expected one to write in; name another --out")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise InputError(f"{path}: no permission to write in {existing}; name another --out")
+    for name in names:
+        if (path / name).is_dir():
+            raise InputError(
+                f"{path / name}: is a directory; expected a file to replace; remove it or name another --out"
+            )
     return path
 
 

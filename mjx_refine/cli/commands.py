@@ -16,6 +16,7 @@ from mjx_refine.errors import InputError
 
 _PATH = click.Path(path_type=Path)
 BACKENDS = ("auto", "mjx", "warp", "mujoco")
+RESULTS = ("refined.yaml", "result.json", "history.csv", "report.html", "overlay.gif", "checkpoint.npz")
 OPTIMIZERS = ("cmaes", "gradient", "hybrid")
 
 
@@ -55,7 +56,7 @@ def _refine(init: Path, video: Path, out: Path, resume: bool, options: dict) -> 
     from mjx_refine.observation import load_observation
     from mjx_refine.scene import load_scenes
 
-    writable_directory(out)
+    writable_directory(out, RESULTS)
     samples = load_scenes(init)
     observation = load_observation(video)
 
