@@ -30,7 +30,8 @@ def form_options(track: Track, lens: Lens, *, airborne: bool) -> list[Form]:
     # A body of more freedom must fit better to be preferred.
     # Seen from above, a puck is as plain a disc as a ball.
     for shape, price in (("upright", 0.0 if pitch < 30 else 0.03), ("lying", 0.05), ("box", 0.05)):
-        if tiny and shape != "box":
+        # A disc in the air is a ball: a can would show another outline as it turns.
+        if shape != "box" and (tiny or (airborne and track.roundness > 0.8)):
             continue
         if shape == "lying" and pitch < 60 and track.roundness > 0.85:
             continue
@@ -39,7 +40,7 @@ def form_options(track: Track, lens: Lens, *, airborne: bool) -> list[Form]:
             # Its height cannot be seen from above.
             radius = sphere_form(track.area).size[0]
             form = dataclasses.replace(form, size=(radius, 0.7 * radius))
-        priced.append((price + form.misfit + (0.1 if tiny else 0.0), form))
+        priced.append((price + form.misfit + (0.1 if tiny or airborne else 0.0), form))
     return [form for _, form in sorted(priced, key=lambda item: item[0])]
 
 
@@ -49,8 +50,8 @@ def form_sets(options: list[list[Form]], most: int) -> list[tuple[Form, ...]]:
     kinds = {kind(f): None for o in options for f in o}
     alike = []
     for k in kinds:
-        forms = [next((f for f in o if kind(f) == k), None) for o in options]
-        if None not in forms:
+        forms = [f for o in options for f in [g for g in o if kind(g) == k][:1]]
+        if len(forms) == len(options):
             alike.append((sum(o.index(f) for o, f in zip(options, forms, strict=True)), _same_size(forms)))
     alike = [forms for _, forms in sorted(alike, key=lambda item: item[0])]
     single = []

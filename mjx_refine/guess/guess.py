@@ -30,8 +30,8 @@ KINDS = 5
 DRAWS = 128
 """Points tried around a hypothesis whose objects hit something."""
 
-LEFT = 0.15
-"""Share of the samples kept for families that scored badly."""
+MOST_ALIKE = 4
+"""Samples of one family, unless there are too few families."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,9 +65,7 @@ def guess_scenes(observation: Observation, count: int = 32, seed: int = 0) -> li
     if not candidates:
         raise InputError(f"{observation.source}: no scene explains the masks; expected objects inside the picture")
     scores = judge([h.scene for h in candidates])
-    ranked = sorted(
-        (_Ranked(float(s), h) for s, h in zip(scores, candidates, strict=True)), key=lambda r: -r.score
-    )
+    ranked = sorted((_Ranked(float(s), h) for s, h in zip(scores, candidates, strict=True)), key=lambda r: -r.score)
     kinds = list(dict.fromkeys(r.hypothesis.scene.shapes for r in ranked))[:KINDS]
     ranked = [r for r in ranked if r.hypothesis.scene.shapes in kinds]
     fitted = _Fitter(judge, seen, seed)(ranked)
@@ -103,7 +101,7 @@ class _Fitter:
     def __call__(self, ranked: list[_Ranked]) -> list[_Ranked]:
         """The best of several families, improved; the most promising of them more than once, from other points."""
         unit = ROLLOUTS // len(self.judge.tracks)
-        chosen = [self._improved(r, unit // 24) for r in _spread(_families(ranked), FITTED)]
+        chosen = [self._improved(self._scattered(r), unit // 24) for r in _spread(_families(ranked), FITTED)]
         for count, limit in ((4, unit // 12), (2, unit // 6)):
             chosen.sort(key=lambda r: -r.score)
             chosen[:count] = [self._improved(self._scattered(r), limit) for r in chosen[:count]]
@@ -156,10 +154,14 @@ def _spread(families: list[_Ranked], count: int) -> list[_Ranked]:
 def _chosen(fitted: list[_Ranked], ranked: list[_Ranked], judge: Judge, count: int, seed: int) -> list[Scene]:
     """The best ``count``, a few of every mode and pitch among them, filled up with variations of the best."""
     pool = sorted([*fitted, *ranked], key=lambda r: -r.score)
-    reserved = _families(ranked)
-    best = pool[: max(1, count - int(LEFT * count))]
-    for r in reserved:
-        if len(best) < count and all(r.hypothesis.family != b.hypothesis.family for b in best):
+    # The best of every mode and pitch first: a clip often bears several readings equally well.
+    best: list[_Ranked] = []
+    for r in pool:
+        if len(best) < count // 2 and all(r.hypothesis.family[:2] != b.hypothesis.family[:2] for b in best):
+            best.append(r)
+    for r in pool:
+        same = sum(r.hypothesis.family == b.hypothesis.family for b in best)
+        if len(best) < count and same < MOST_ALIKE and all(r is not b for b in best):
             best.append(r)
     for r in pool:
         if len(best) < count and all(r is not b for b in best):

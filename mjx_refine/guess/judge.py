@@ -56,7 +56,7 @@ class Judge:
     def of_batch(self, batch: SceneBatch) -> Float[np.ndarray, "batch"]:
         """Ditto for candidates of one kind."""
         poses = self.simulator(batch.shapes).rollout(batch, self.length)
-        bad = ~np.isfinite(poses).all((1, 2, 3))
+        bad = ~np.asarray(np.isfinite(poses).all((1, 2, 3)))
         poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
         reach = supports(poses, batch, self.size, DIRECTIONS).astype(np.float64)
         parts = [self._object(reach[:, :, n], track) for n, track in enumerate(self.tracks)]
@@ -83,7 +83,11 @@ class Judge:
 
 def reach_width(reach: np.ndarray) -> np.ndarray:
     """Mean width of outlines [px]."""
-    return 2 * reach.mean(-1) if reach.ndim == 1 else (reach[..., : DIRECTIONS // 2] + reach[..., DIRECTIONS // 2 :]).mean(-1)
+    return (
+        2 * reach.mean(-1)
+        if reach.ndim == 1
+        else (reach[..., : DIRECTIONS // 2] + reach[..., DIRECTIONS // 2 :]).mean(-1)
+    )
 
 
 _NORMALS = directions(DIRECTIONS)

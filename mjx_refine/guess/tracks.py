@@ -111,9 +111,11 @@ def moving_objects(observation: Observation) -> Int[np.ndarray, "frames height w
     result = np.zeros(moving.shape, np.int32)
     last: dict[int, tuple[int, np.ndarray, np.ndarray, float]] = {}
     for t, frame in enumerate(moving):
-        labels, count = ndimage.label(ndimage.binary_opening(frame, iterations=1))
-        areas = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-        order = [i for i in np.argsort(-areas, kind="stable") if areas[i] >= max(MIN_PIXELS, 0.03 * areas.max())]
+        labels = np.asarray(ndimage.label(ndimage.binary_opening(frame, iterations=1))[0])  # type: ignore[index]
+        areas = np.bincount(labels.ravel())[1:]
+        order = [
+            i for i in np.argsort(-areas, kind="stable") if areas[i] >= max(MIN_PIXELS, 0.03 * areas.max(initial=0))
+        ]
         free = set(last)
         for i in order[:MAX_OBJECTS]:
             centre = np.array(ndimage.center_of_mass(labels == i + 1))[::-1]
@@ -132,12 +134,10 @@ def moving_objects(observation: Observation) -> Int[np.ndarray, "frames height w
     return np.where(np.isin(result, list(keep)), result, 0)
 
 
-def _track(
-    observation: Observation, masks: np.ndarray, seen: Outlines, column: int, no_masks: bool
-) -> Track:
+def _track(observation: Observation, masks: np.ndarray, seen: Outlines, column: int, no_masks: bool) -> Track:
     support = seen.support[:, column]
     half = DIRECTIONS // 2
-    whole = np.isfinite(support).all(-1)
+    whole = np.asarray(np.isfinite(support).all(-1))
     visible = np.isfinite(seen.centre[:, column, 0])
     # Opposite edges that are both known give the middle even where another edge is cut.
     quarter = DIRECTIONS // 4
@@ -149,7 +149,7 @@ def _track(
     usable = whole if whole.sum() >= 2 else visible
     frames = np.nonzero(usable)[0]
     across = support[:, :half] + support[:, half:]
-    first = frames[: max(1, min(3, len(frames)))]
+    first = frames[:3]
     area = float(np.median(seen.area[first, column]))
     widths = np.median(across[first], axis=0) if whole.any() else np.full(half, np.nan)
     widths = np.where(np.isfinite(widths), widths, 2 * np.sqrt(max(area, 1.0) / np.pi))
