@@ -175,7 +175,7 @@ def _chosen(fitted: list[_Ranked], ranked: list[_Ranked], judge: Judge, count: i
 
 
 def _varied(scene: Scene, generator: np.random.Generator) -> Scene:
-    """A tenth of a prior width to every side."""
+    """A fifth of a prior width, at random, in every parameter."""
     space = Space.around(scene)
     point = space.start + 0.2 * space.sigma * generator.standard_normal(space.dimension)
     return space.scene_at(np.clip(point, 0.0, 1.0))
