@@ -32,7 +32,13 @@ def digest(*parts: object) -> str:
 def save_checkpoint(path: Path, values: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
     """Writes ``values`` (as JSON) and ``arrays``, whole or not at all."""
     text = np.frombuffer(json.dumps({"version": VERSION, **values}).encode(), np.uint8)
-    files.write_atomic(path, lambda stream: np.savez(stream, **{"__values__": text}, **arrays))
+    content = {**arrays, "__values__": text}
+    files.write_atomic(path, lambda stream: np.savez(stream, **content))  # type: ignore[arg-type]
+
+
+def damaged(path: Path, error: Exception) -> InputError:
+    """What to say of a checkpoint that cannot be used."""
+    return InputError(f"{path}: not a readable checkpoint ({error}); run again without --resume")
 
 
 def load_checkpoint(path: Path, expected: str) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
@@ -44,11 +50,12 @@ def load_checkpoint(path: Path, expected: str) -> tuple[dict[str, Any], dict[str
     if not path.exists():
         return None
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        # Opened here: numpy leaves a damaged file open.
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
-        values = json.loads(arrays.pop("__values__").tobytes())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not a readable checkpoint ({error}); run again without --resume") from error
+        values = dict(json.loads(arrays.pop("__values__").tobytes()))
+    except (OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+        raise damaged(path, error) from error
     if values.get("version") != VERSION or values.get("digest") != expected:
         raise InputError(
             f"{path}: made for another input or other options; expected those of this call; "

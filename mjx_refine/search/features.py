@@ -63,7 +63,7 @@ def _measure(frame: np.ndarray, i: int, normals: np.ndarray):
     centre = np.array([columns.mean() + left + 0.5, rows.mean() + top + 0.5])
     if area < MIN_PIXELS:
         return area, centre, np.full(len(normals), np.nan)
-    rows, columns = np.nonzero(mask & ~ndimage.binary_erosion(mask))
+    rows, columns = np.nonzero(mask & np.logical_not(ndimage.binary_erosion(mask)))
     along = np.stack([columns + left + 0.5, rows + top + 0.5], -1) @ normals.T
     extreme = along.argmax(0)
     # Half a pixel: an edge lies on average that far beyond the last centre inside, across the nearer axis.

@@ -123,7 +123,7 @@ class LeastSquares:
         batch = self.space.decode(points)
         poses = self.rollout(batch, frames)
         self.spent += len(points) * frames / len(self.target)
-        bad = ~np.isfinite(poses).all((1, 2, 3))
+        bad = np.logical_not(np.asarray(np.isfinite(poses).all((1, 2, 3))))
         poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
         # The outlines of all frames, so that one length is compiled; those beyond the horizon repeat its last.
         beyond = np.repeat(poses[:, -1:], len(self.target) - frames, axis=1)

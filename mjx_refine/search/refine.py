@@ -11,6 +11,7 @@ import numpy as np
 from mjx_refine.batch import batch_from_scenes
 from mjx_refine.compile_cache import enable_cache
 from mjx_refine.errors import InputError
+from mjx_refine.files import remove_stale_parts
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Samples, Scene
 from mjx_refine.search.options import Options
@@ -28,9 +29,9 @@ UNDETERMINED = "one prior width changes the fitness by less than 0.002; kept at 
 _COMPILE = {"seconds": 0.0}
 
 
-def _count_compilation(name: str, seconds: float, **_: object) -> None:
-    if name.endswith("backend_compile_duration"):
-        _COMPILE["seconds"] += seconds
+def _count_compilation(event: str, duration_secs: float, **_: str | int) -> None:
+    if event.endswith("backend_compile_duration"):
+        _COMPILE["seconds"] += duration_secs
 
 
 jax.monitoring.register_event_duration_secs_listener(_count_compilation)
@@ -103,6 +104,7 @@ def refine(
 def _made(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        remove_stale_parts(folder)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); expected a folder to write in") from error
     return folder

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from mjx_fitness import Scores
 
 from mjx_refine.scene import Scene
-from mjx_refine.search.checkpoint import digest, load_checkpoint, save_checkpoint
+from mjx_refine.search.checkpoint import damaged, digest, load_checkpoint, save_checkpoint
 from mjx_refine.search.landing import LeastSquares, stages
 from mjx_refine.search.objective import Objective
 from mjx_refine.search.problem import Problem, Start
@@ -105,8 +105,14 @@ class Run:
         self.before = 0.0
         self._saved: tuple[dict, dict] | None = None
         self._written = 0.0
+        self._planned = 0
+        self._best = (-np.inf, 0.0, 0.0)
         if resume and checkpoint is not None:
-            self._restore(load_checkpoint(checkpoint, self.digest))
+            loaded = load_checkpoint(checkpoint, self.digest)
+            try:
+                self._restore(loaded)
+            except (KeyError, ValueError, TypeError, AttributeError) as error:
+                raise damaged(checkpoint, error) from error
 
     @property
     def seconds(self) -> float:
@@ -160,7 +166,7 @@ class Run:
         plan = [(rank, 0) for rank in range(self.options.starts)]
         plan += [(-1, 2)] + [(rank, 0) for rank in range(self.options.starts, 3 * self.options.starts)] + [(-1, 2)]
         for step, (rank, hops) in enumerate(plan):
-            if step < len(self.landed) or rank >= len(self.problem.starts):
+            if step < self._planned or rank >= len(self.problem.starts):
                 continue
             done = max((r.iou for r in self.landed), default=0.0)
             if step >= self.options.starts and done >= LANDED_WELL:
@@ -170,6 +176,7 @@ class Run:
             if rank < 0:
                 rank = max(self.landed, key=lambda landed: landed.fitness).rank
             self.landed.append(self._land_one(rank, limit - self.evaluations, hops))
+            self._planned = step + 1
             self._save(force=True)
 
     def _land_one(self, rank: int, limit: int, hops: int) -> Landed:
@@ -177,14 +184,16 @@ class Run:
         space = Space.around(start.scene)
         reference = self.problem.reference(start.scene.shapes)
         columns, image = self.problem.columns(start.matching), self.problem.observation.size
-        squares = LeastSquares(space, reference.rollout, self.problem.seen, columns, image, self.problem.flow, limit, self.options.seed)
+        squares = LeastSquares(
+            space, reference.rollout, self.problem.seen, columns, image, self.problem.flow, limit, self.options.seed
+        )
         objective = self._objective(start, space)
         before = self.evaluations
 
         def show(stage, point: np.ndarray) -> None:
             self.evaluations = before + squares.evaluations
             costs, scores = objective(point[None])
-            self._step("land", -float(costs[0]), scores, float(stage.frames))
+            self._step("land", (-float(costs[0]), float(scores.iou[0]), float(scores.epe[0])), float(stage.frames))
 
         landing = squares.run(space.start, stages(self.problem.observation.length), hops, show)
         self.evaluations = before + landing.evaluations
@@ -220,8 +229,11 @@ class Run:
             elites, elite_costs = mean[None], np.full(1, np.inf)
         else:
             arrays = self._saved[1]
-            state = mjx_cmaes.load_state(settings, {k[4:]: v for k, v in arrays.items() if k.startswith("cma.")})
-            elites, elite_costs = arrays["elites"], arrays["elite_costs"]
+            try:
+                state = mjx_cmaes.load_state(settings, {k[4:]: v for k, v in arrays.items() if k.startswith("cma.")})
+                elites, elite_costs = arrays["elites"], arrays["elite_costs"]
+            except (KeyError, ValueError, TypeError) as error:
+                raise damaged(Path(self.path or ""), error) from error
         while self.evaluations + self.options.population <= self.options.budget:
             reason = mjx_cmaes.should_stop(settings, state)
             if reason is not None:
@@ -234,16 +246,12 @@ class Run:
             self.evaluations += len(points)
             elites, elite_costs, best = _merge(elites, elite_costs, points, costs)
             if best is not None:
-                self._best = (-float(costs[best]), scores.candidate(best))
-            self._step("search", self._best[0], self._best[1], float(state.std.mean()))
+                self._best = (-float(costs[best]), float(scores.iou[best]), float(scores.epe[best]))
+            self._step("search", self._best, float(state.std.mean()))
             arrays = {f"cma.{k}": v for k, v in mjx_cmaes.save_state(state).items()}
-            self._saved = ({"best": self._best_values()}, {**arrays, "elites": elites, "elite_costs": elite_costs})
+            self._saved = ({"best": self._best}, {**arrays, "elites": elites, "elite_costs": elite_costs})
             self._save()
         return "The budget of rollouts is spent.", [np.clip(state.mean, 0, 1), *elites]
-
-    def _best_values(self) -> list[float]:
-        fitness, scores = self._best
-        return [fitness, float(scores.iou[0]), float(scores.epe[0])]
 
     # Finish -------------------------------------------------------------------------------------------------------
 
@@ -279,7 +287,7 @@ class Run:
 
     # Bookkeeping --------------------------------------------------------------------------------------------------
 
-    def _step(self, phase: str, fitness: float, scores: Scores, spread: float) -> None:
+    def _step(self, phase: str, best: tuple[float, float, float], spread: float) -> None:
         iteration = sum(step.phase == phase for step in self.history)
         step = Step(
             phase=phase,
@@ -287,9 +295,9 @@ class Run:
             evaluations=self.evaluations,
             budget=self.options.budget,
             seconds=self.seconds,
-            fitness=fitness,
-            iou=float(scores.iou[0]),
-            epe=float(scores.epe[0]),
+            fitness=best[0],
+            iou=best[1],
+            epe=best[2],
             spread=spread,
         )
         self.history.append(step)
@@ -304,6 +312,7 @@ class Run:
             "evaluations": self.evaluations,
             "seconds": self.seconds,
             "history": [dataclasses.astuple(step) for step in self.history],
+            "planned": self._planned,
             "landed": [[r.rank, r.fitness, r.iou] for r in self.landed],
             "searching": self._saved is not None,
         }
@@ -322,23 +331,15 @@ class Run:
             return
         values, arrays = loaded
         self.evaluations, self.before = values["evaluations"], values["seconds"]
+        self._planned = values["planned"]
         self.history = [Step(*row) for row in values["history"]]
         for k, (rank, fitness, iou) in enumerate(values["landed"]):
             point, covariance = arrays[f"landed.{k}.point"], arrays[f"landed.{k}.covariance"]
             self.landed.append(Landed(rank, point, covariance, fitness, iou))
         if values["searching"]:
-            fitness, iou, epe = values["best"]
-            self._best = (fitness, _Shown(np.array([iou]), np.array([epe])))
+            self._best = tuple(values["best"])
             self._saved = (values, arrays)
         self.progress.message(f"resumed after {self.evaluations} rollouts")
-
-
-@dataclasses.dataclass(frozen=True)
-class _Shown:
-    """The two scores that a display needs."""
-
-    iou: np.ndarray
-    epe: np.ndarray
 
 
 def _merge(

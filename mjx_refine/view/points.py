@@ -55,6 +55,7 @@ def point_flow(
     arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
     size = next((b for b in BATCHES if b >= len(poses)), -(-len(poses) // BATCHES[-1]) * BATCHES[-1])
     padded = tuple(
-        jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32) for a in map(np.asarray, arrays)
+        jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32)
+        for a in map(np.asarray, arrays)
     )
     return np.asarray(_point_flow(batch.shapes, padded, jnp.asarray(pixels, jnp.float32), image))[: len(poses)]
