@@ -11,6 +11,7 @@ import numpy as np
 from mjx_refine.guess.forms import form_options, form_sets
 from mjx_refine.guess.lift import Form, Lens, extent_below, fly, onto_plane
 from mjx_refine.guess.motion import Motion, motions, restitution
+from mjx_refine.guess.scaling import scaled
 from mjx_refine.guess.tracks import Track
 from mjx_refine.scene import Body, Scene
 from mjx_refine.space import rotations
@@ -337,26 +338,6 @@ def _rescaled(scene: Scene, family: tuple) -> list[Hypothesis]:
     if 0.6 < factor < 1.7:
         return [Hypothesis(scene, family)]
     return [Hypothesis(scene, family), Hypothesis(scaled(scene, factor), family)]
-
-
-def scaled(scene: Scene, factor: float) -> Scene:
-    """All lengths times ``factor``; the clip stays the same."""
-
-    def times(v):
-        return tuple(c * factor for c in v)
-
-    bodies = tuple(
-        dataclasses.replace(
-            b,
-            size=times(b.size),
-            position=times(b.position),
-            linear_velocity=times(b.linear_velocity),
-            friction=(b.friction[0], b.friction[1] * factor),
-        )
-        for b in scene.objects
-    )
-    camera = dataclasses.replace(scene.camera, position=times(scene.camera.position))
-    return dataclasses.replace(scene, objects=bodies, camera=camera, gravity=times(scene.gravity))
 
 
 def _from_side(clip: Clip, lens: Lens, most: int) -> list[Hypothesis]:
