@@ -11,8 +11,21 @@ from mjx_refine import files
 from mjx_refine.scene.model import Body, Scene
 
 
+def _plain(value):
+    """``value`` in Python's own numbers: numpy's are floats, but YAML does not know them."""
+    if isinstance(value, dict):
+        return {key: _plain(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return float(value) if isinstance(value, float) else value
+
+
 def scene_entries(scene: Scene) -> list[dict]:
     """The list of entries that the YAML holds, of plain dicts, lists and numbers."""
+    return _plain(_entries(scene))
+
+
+def _entries(scene: Scene) -> list[dict]:
     entries = [_body_entry(body) for body in scene.objects]
     camera = scene.camera
     entries.append(

@@ -324,3 +324,9 @@ def test_nothing_is_executed(tmp_path, monkeypatch):
         with pytest.raises(InputError, match="not safe YAML"):
             parse_scenes(f"- !!{tag} [owned]\n")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_numpy_numbers_are_written_as_numbers():
+    body = Body("sphere", "a", (np.float64(0.1),), (0.0, np.float64(0.2), 0.1), mass=np.float64(1.5))
+    scene = Scene((body,), Camera((0.0, -2.0, 3.0), np.float64(45.0)))
+    assert parse_scenes(dump_scene(scene))[0] == scene
