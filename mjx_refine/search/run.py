@@ -30,12 +30,12 @@ LANDED_WELL = 0.93
 LANDING_SHARE = 0.6
 """Part of the budget that least squares may spend before the population search (``hybrid``)."""
 
-NARROWING = 0.25
-"""Factor on the landing's covariance for the first generation."""
+NARROW = (0.25, 0.05)
+"""After a good landing, the first generation's (factor on the variance that the landing found, prior widths that it may
+spread where the landing left a parameter open). More, and contacts beyond those landed on spoil nearly every candidate."""
 
-PRIOR_LEFT = 0.05
-"""Prior widths that the first generation may spread where the landing left a parameter open. More, and contacts beyond
-those that were landed on spoil almost every candidate of it."""
+WIDE = (400.0, 1.0)
+"""The same after a poor landing, which the population search must leave again."""
 
 ELITES = 8
 """Candidates of the search that are compared at full resolution in the end."""
@@ -198,20 +198,15 @@ class Run:
         landing = squares.run(space.start, stages(self.problem.observation.length), hops, show)
         self.evaluations = before + landing.evaluations
         scores = self.problem.score([space.scene_at(landing.point)], start.matching)
-        curvature = np.linalg.inv(landing.covariance * (1 / np.outer(space.sigma, space.sigma)))
-        seen = curvature - np.eye(len(curvature))
-        loose = seen / NARROWING + np.eye(len(curvature)) / PRIOR_LEFT**2
-        covariance = np.linalg.inv(loose) * np.outer(space.sigma, space.sigma)
-        return Landed(
-            rank, landing.point, (covariance + covariance.T) / 2, float(scores.fitness[0]), float(scores.iou[0])
-        )
+        return Landed(rank, landing.point, landing.covariance, float(scores.fitness[0]), float(scores.iou[0]))
 
     def _beginning(self) -> tuple[Start, Space, np.ndarray, np.ndarray]:
         """Where the population search starts: the best landing, or the best sample."""
         if self.landed:
             best = max(self.landed, key=lambda landed: landed.fitness)
             start = self.problem.starts[best.rank]
-            return start, Space.around(start.scene), best.point, best.covariance
+            space = Space.around(start.scene)
+            return start, space, best.point, _first_covariance(best, space)
         start = self.problem.starts[0]
         space = Space.around(start.scene)
         return start, space, space.start, np.diag(space.sigma**2)
@@ -340,6 +335,16 @@ class Run:
             self._best = tuple(values["best"])
             self._saved = (values, arrays)
         self.progress.message(f"resumed after {self.evaluations} rollouts")
+
+
+def _first_covariance(landed: Landed, space: Space) -> np.ndarray:
+    """Covariance of the first generation after a landing, unit box."""
+    factor, widths = NARROW if landed.iou >= LANDED_WELL else WIDE
+    scale = np.outer(space.sigma, space.sigma)
+    # In prior widths the landing's inverse covariance is what the clip told, plus one for the prior.
+    told = np.linalg.inv(landed.covariance / scale) - np.eye(space.dimension)
+    covariance = np.linalg.inv(told / factor + np.eye(space.dimension) / widths**2) * scale
+    return (covariance + covariance.T) / 2
 
 
 def _merge(
