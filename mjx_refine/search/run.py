@@ -34,7 +34,7 @@ NARROW = (0.25, 0.05)
 """After a good landing, the first generation's (factor on the variance that the landing found, prior widths that it may
 spread where the landing left a parameter open). More, and contacts beyond those landed on spoil nearly every candidate."""
 
-WIDE = (400.0, 1.0)
+WIDE = (4.0, 0.2)
 """The same after a poor landing, which the population search must leave again."""
 
 ELITES = 8
