@@ -1,9 +1,6 @@
 """Turns a rough guess of a scene into a MuJoCo simulation that replays a video.
 
-    samples = load_scenes("best32.yaml")
-    observation = load_observation("flows.npz")
-    result = refine(samples, observation, Options(seed=0))
-    save_scene("refined.yaml", result.scene)
+``refine(load_scenes("best32.yaml"), load_observation("flows.npz"), Options(seed=0)).scene`` is the refined scene.
 """
 
 from mjx_refine.errors import InputError

@@ -85,7 +85,6 @@ class Scores:
     object_epe: Float[np.ndarray, "batch"]
     fitness: Float[np.ndarray, "batch"]
 
-
     def candidate(self, row: int) -> Scores:
         """The scores of one candidate, as a batch of one."""
         return Scores(**{f.name: getattr(self, f.name)[row : row + 1] for f in dataclasses.fields(self)})
