@@ -21,7 +21,7 @@ from mjx_refine.scene import Samples
 CLIPS = {
     "carom_big_collision": {"fps": 240, "start": 0.125, "end": 0.575, "stride": 4},
     "carom_rotation": {"fps": 240, "start": 0.125, "end": 0.625, "stride": 4},
-    "greenball_small_960x540": {"start": 0.434, "end": 1.8, "stride": 1, "size": "480x270"},
+    "greenball_small_960x540": {"start": 0.434, "end": 2.169, "stride": 1, "size": "480x270"},
     "rolling_cylinder": {"fps": 240, "start": 0.3584, "end": 1.325, "stride": 8},
     "projectile_45deg_2.687mps": {"fps": 240, "start": 0.121, "end": 0.55, "stride": 3},
     "sliding_R1": {"fps": 240, "start": 0.3334, "end": 1.375, "stride": 8},

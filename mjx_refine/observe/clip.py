@@ -14,6 +14,7 @@ from mjx_refine.observation import Observation, make_observation
 from mjx_refine.observe.camera import CameraMotion, measure_camera
 from mjx_refine.observe.flow import FlowField, measure_flow
 from mjx_refine.observe.segment import segment
+from mjx_refine.observe.spikes import cut_spikes
 from mjx_refine.observe.video import Clip, read_clip, read_masks
 
 _MANY_FRAMES = 300
@@ -110,6 +111,9 @@ def observe_clip(
                 f"{' (' + '; '.join(found.warnings) + ')' if found.warnings else ''}; "
                 "choose other --start/--end, a higher --stride, or give --masks"
             )
+        masks, cut = cut_spikes(masks, clip.frames)
+        if cut:
+            warnings.append(f"in {cut} frames a reflection or shadow touched an object and was cut off its mask")
     else:
         masks = given
     tell(0.7, "flow")
