@@ -1,7 +1,12 @@
-"""Outlines of bodies as support functions of their silhouettes: exact, smooth in the pose, without drawing a pixel."""
+"""Outlines of bodies as support functions of their silhouettes: exact, smooth in the pose, without drawing a pixel.
+
+Everything but ``supports`` is a pure function of arrays that JAX can differentiate and vectorise, in the arrays' own
+precision. Coordinates of the camera are here those of the picture: right, down, ahead.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import jax
@@ -13,14 +18,45 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.scene import Shape
 from mjx_refine.view.frames import camera_matrix, rotation_matrix
 
-RIM = 32
-"""Points on a circle; its polygon falls short of it by at most 0.5 % of the radius."""
-
 BATCHES = (8, 32, 128)
 """Batch sizes that are compiled; larger batches are multiples of the last."""
 
 NEAR = 0.02
-"""Depth [m] to which points behind the camera are moved."""
+"""Depth [m] in front of which an object is moved ahead: no picture of it is bounded there."""
+
+CORNERS = tuple((x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1))
+"""A box's corners in half extents; corner 4 i + 2 j + k has signs i, j, k."""
+
+Arrays = tuple[
+    Float[Array, "batch frames objects 7"],
+    Float[Array, "batch objects 3"],
+    Float[Array, "batch 3"],
+    Float[Array, "batch"],
+    Float[Array, "batch"],
+]
+"""Poses [m, unit quaternion wxyz], ``geom_size`` [m], camera position [m], pitch [rad] and vertical field of view [rad]."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Placed:
+    """Objects in coordinates of the camera: right, down, ahead.
+
+    Attributes:
+      centre: [m].
+      shown: the centre, moved ahead where the object reaches the camera's plane, so that its picture is bounded [m].
+      nearest: depth of the object's nearest point [m].
+      axes: column j is the object's axis j.
+      size: MuJoCo's ``geom_size`` [m].
+      focal: focal length [px].
+    """
+
+    centre: Float[Array, "batch frames objects 3"]
+    shown: Float[Array, "batch frames objects 3"]
+    nearest: Float[Array, "batch frames objects"]
+    axes: Float[Array, "batch frames objects 3 3"]
+    size: Float[Array, "batch 1 objects 3"]
+    focal: Float[Array, "batch 1 1"]
 
 
 def directions(count: int) -> Float[np.ndarray, "directions 2"]:
@@ -29,62 +65,119 @@ def directions(count: int) -> Float[np.ndarray, "directions 2"]:
     return np.stack([np.cos(angle), np.sin(angle)], -1)
 
 
-def _circle() -> Array:
-    angle = 2 * jnp.pi * jnp.arange(RIM) / RIM
-    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], -1)
+def camera_axes(pitch: Float[Array, "batch"]) -> Float[Array, "batch 3 3"]:
+    """The picture's right, down and ahead in the world, as columns."""
+    return camera_matrix(pitch) * jnp.asarray([1.0, -1.0, -1.0], pitch.dtype)
 
 
-def _sphere(position: Array, size: Array, camera: Array) -> Array:
-    """The circle in which the view cone touches the sphere."""
-    to_centre = position - camera
-    distance = jnp.maximum(jnp.linalg.norm(to_centre, axis=-1, keepdims=True), 1e-6)
-    axis = to_centre / distance
-    ratio = jnp.minimum(size[..., :1] / distance, 0.999)
-    helper = jnp.where(jnp.abs(axis[..., 2:]) < 0.9, jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 0.0, 0.0]))
-    e1 = jnp.cross(axis, helper)
-    e1 = e1 / jnp.linalg.norm(e1, axis=-1, keepdims=True)
-    e2 = jnp.cross(axis, e1)
-    middle = position - axis * (size[..., :1] * ratio)
-    radius = size[..., :1] * jnp.sqrt(1 - ratio * ratio)
-    circle = _circle()
-    return middle[..., None, :] + radius[..., None] * (
-        circle[:, :1] * e1[..., None, :] + circle[:, 1:] * e2[..., None, :]
-    )
+def _ahead(nearest: Array) -> Array:
+    """Depth of the nearest point of the object as it is shown: once differentiable, between NEAR / 2 and NEAR behind."""
+    lack = jnp.maximum(NEAR - nearest, 0.0) / NEAR
+    return 0.5 * NEAR * (1.0 + 1.0 / (1.0 + 2.0 * lack))
 
 
-def _local_points(shape: Shape, size: Array) -> Array:
-    """Extreme points in the body's frame, (..., points, 3)."""
-    if shape == "box":
-        signs = jnp.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], jnp.float32)
-        return size[..., None, :] * signs
-    circle = _circle()
-    rim = jnp.concatenate([circle, jnp.zeros((RIM, 1))], -1)
-    cap = jnp.array([0.0, 0.0, 1.0])
-    radius, half = size[..., None, :1], size[..., None, 1:2]
-    return jnp.concatenate([radius * rim + half * cap, radius * rim - half * cap], -2)
-
-
-@functools.partial(jax.jit, static_argnames=("shapes", "count", "width", "height"))
-def _supports(shapes, poses, size, camera_position, camera_pitch, camera_fovy, count, width, height):
-    camera = camera_matrix(camera_pitch)[:, None, None]
-    focal = ((height / 2) / jnp.tan(camera_fovy / 2))[:, None, None]
-    normals = jnp.asarray(directions(count), jnp.float32)
-    result = []
+def place(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]) -> Placed:
+    """Objects as the camera has them; ``image`` is (width, height) [px]."""
+    poses, size, position, pitch, fovy = arrays
+    camera = camera_axes(pitch)[:, None, None]
+    offset = poses[..., :3] - position[:, None, None]
+    # Written out: a batched matrix product of this size is slow on every device.
+    centre = (camera * offset[..., :, None]).sum(-2)
+    axes = (camera[..., :, :, None] * rotation_matrix(poses[..., 3:])[..., :, None, :]).sum(-3)
+    extent = jnp.broadcast_to(size[:, None], centre.shape)
+    reaches = []
     for n, shape in enumerate(shapes):
-        pose, extent = poses[:, :, n], size[:, None, n]
+        along, half = axes[:, :, n, 2], extent[:, :, n]
         if shape == "sphere":
-            points = _sphere(pose[..., :3], jnp.broadcast_to(extent, pose[..., :3].shape), camera_position[:, None])
+            reaches.append(half[..., 0])
+        elif shape == "cylinder":
+            # A thousandth of the radius too much face on, where the square root has no derivative.
+            across = jnp.sqrt(along[..., 0] ** 2 + along[..., 1] ** 2 + 1e-6)
+            reaches.append(half[..., 0] * across + half[..., 1] * jnp.abs(along[..., 2]))
         else:
-            local = _local_points(shape, extent)
-            turned = (rotation_matrix(pose[..., 3:])[..., None, :, :] * local[..., None, :]).sum(-1)
-            points = turned + pose[..., None, :3]
-        relative = points - camera_position[:, None, None]
-        x, y, z = ((camera[..., :, i] * relative).sum(-1) for i in range(3))
-        depth = jnp.maximum(-z, NEAR)
-        px, py = focal * x / depth + width / 2, -focal * y / depth + height / 2
-        along = px[..., None] * normals[:, 0] + py[..., None] * normals[:, 1]
-        result.append(along.max(-2))
-    return jnp.stack(result, 2)
+            reaches.append((half * jnp.abs(along)).sum(-1))
+    reach = jnp.stack(reaches, -1)
+    nearest = centre[..., 2] - reach
+    depth = jnp.where(nearest < NEAR, reach + _ahead(nearest), centre[..., 2])
+    shown = jnp.concatenate([centre[..., :2], depth[..., None]], -1)
+    focal = ((image[1] / 2) / jnp.tan(fovy / 2))[:, None, None]
+    return Placed(centre, shown, nearest, axes, size[:, None], focal)
+
+
+def corners(placed: Placed, n: int) -> Float[Array, "batch frames 8 2"]:
+    """Box ``n``'s corners in the picture, from the principal point [px]."""
+    signs = jnp.asarray(CORNERS, placed.size.dtype) * placed.size[:, :, n, None]
+    x, y, depth = (
+        (placed.axes[:, :, n, None, i] * signs).sum(-1) + placed.shown[:, :, n, None, i] for i in range(3)
+    )
+    scale = placed.focal / jnp.maximum(depth, 0.25 * NEAR)
+    return jnp.stack([scale * x, scale * y], -1)
+
+
+def _rim(centre: Array, axis: Array, radius: Array, nx: Array, ny: Array) -> Array:
+    """Support of the perspective picture of a circle, over the focal length.
+
+    The line n . p = s is a plane through the camera with normal l = (n, -s). It touches the circle with centre m, unit
+    axis a and radius r where l . m + r |l - (l . a) a| = 0: a quadratic in s. With t the picture's direction across n,
+    its discriminant is r^2 times (a.t)^2 ((n.m)^2 + m_d^2 - r^2) + ((a.n) (n.m) + a_d m_d)^2, a sum without cancellation.
+    """
+    mx, my, md = (centre[..., i, None] for i in range(3))
+    ax, ay, ad = (axis[..., i, None] for i in range(3))
+    radius = radius[..., None]
+    beside, lean, across = nx * mx + ny * my, nx * ax + ny * ay, nx * ay - ny * ax
+    square = radius * radius
+    leading = md * md - square * (ax * ax + ay * ay)
+    inner = across * across * (beside * beside + md * md - square) + (lean * beside + ad * md) ** 2
+    # Seen edge on, a circle has a corner; a millionth of its radius rounds it.
+    root = jnp.sqrt(jnp.maximum(inner, 0.0) + 1e-12 * md * md)
+    return (beside * md + square * lean * ad + radius * root) / leading
+
+
+def _sphere(centre: Array, radius: Array, nx: Array, ny: Array) -> Array:
+    """Ditto of a sphere: l . m + r |l| = 0."""
+    mx, my, md = (centre[..., i, None] for i in range(3))
+    radius = radius[..., None]
+    beside, leading = nx * mx + ny * my, (md - radius) * (md + radius)
+    return (beside * md + radius * jnp.sqrt(beside * beside + leading)) / leading
+
+
+def support_of(shape: Shape, placed: Placed, n: int, normals: Array) -> Float[Array, "batch frames directions"]:
+    """Support function of object ``n``'s silhouette from the principal point [px].
+
+    Args:
+      shape: its shape.
+      placed: all objects.
+      n: which one.
+      normals: unit vectors, (directions, 2) or (batch, frames, directions, 2).
+    """
+    nx, ny = normals[..., 0], normals[..., 1]
+    centre, axis, size = placed.shown[:, :, n], placed.axes[:, :, n, :, 2], placed.size[:, :, n]
+    if shape == "sphere":
+        return placed.focal * _sphere(centre, size[..., 0], nx, ny)
+    if shape == "cylinder":
+        half = size[..., 1, None] * axis
+        ends = (_rim(centre + sign * half, axis, size[..., 0], nx, ny) for sign in (1, -1))
+        return placed.focal * functools.reduce(jnp.maximum, ends)
+    points = corners(placed, n)
+    # Corner by corner: nothing of the size corners times directions is written to memory.
+    reach = (points[:, :, k, 0, None] * nx + points[:, :, k, 1, None] * ny for k in range(8))
+    return functools.reduce(jnp.maximum, reach)
+
+
+def support_function(
+    shapes: tuple[Shape, ...], arrays: Arrays, count: int, image: tuple[int, int]
+) -> Float[Array, "batch frames objects directions"]:
+    """How far each silhouette reaches in each of ``count`` directions of the image [px]; pure, for ``jax.jit``.
+
+    Exact and with exact derivatives wherever the outline has one contact point; finite everywhere.
+    """
+    placed = place(shapes, arrays, image)
+    normals = jnp.asarray(directions(count), placed.centre.dtype)
+    middle = 0.5 * image[0] * normals[:, 0] + 0.5 * image[1] * normals[:, 1]
+    return jnp.stack([support_of(shape, placed, n, normals) for n, shape in enumerate(shapes)], 2) + middle
+
+
+_support_function = jax.jit(support_function, static_argnums=(0, 2, 3))
 
 
 def supports(
@@ -99,5 +192,5 @@ def supports(
     # Few sizes are ever compiled: a search asks for batches of many lengths.
     size = next((b for b in BATCHES if b >= len(poses)), -(-len(poses) // BATCHES[-1]) * BATCHES[-1])
     padded = [np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]) for a in map(np.asarray, arrays)]
-    device = [jnp.asarray(a, jnp.float32) for a in padded]
-    return np.asarray(_supports(batch.shapes, *device, count, *image))[: len(poses)]
+    device = tuple(jnp.asarray(a, jnp.float32) for a in padded)
+    return np.asarray(_support_function(batch.shapes, device, count, image))[: len(poses)]
