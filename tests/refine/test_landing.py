@@ -15,6 +15,7 @@ from mjx_refine.search.features import DIRECTIONS, flow_points, outlines
 from mjx_refine.search.landing import LeastSquares, Stage, stages
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.space import Space
+from mjx_refine.view.outline import directions
 from mjx_refine.view.picture import draw
 from mjx_refine.view.tiles import TileScorer
 
@@ -183,3 +184,26 @@ def test_stages_reach_the_whole_clip(length):
     assert schedule[0].frames == 1
     assert [s.frames for s in schedule] == sorted(s.frames for s in schedule)
     assert schedule[-1].frames == schedule[-2].frames == length
+
+
+@pytest.mark.parametrize("radius", [8.0, 20.0, 45.0])
+@pytest.mark.parametrize("shape", ["disc", "rectangle"])
+def test_reach_of_masks_is_unbiased_in_every_direction(shape, radius):
+    generator = np.random.default_rng(7)
+    normals = directions(DIRECTIONS)
+    rows, columns = np.mgrid[0:160, 0:160] + 0.5
+    errors = []
+    for _ in range(60):
+        centre, turn = 80 + generator.uniform(0, 1, 2), generator.uniform(0, np.pi)
+        u = (columns - centre[0]) * np.cos(turn) + (rows - centre[1]) * np.sin(turn)
+        v = (rows - centre[1]) * np.cos(turn) - (columns - centre[0]) * np.sin(turn)
+        if shape == "disc":
+            inside, true = u**2 + v**2 < radius**2, normals @ centre + radius
+        else:
+            inside = (np.abs(u) < radius) & (np.abs(v) < radius / 2)
+            along = normals @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+            true = normals @ centre + np.abs(along) @ [radius, radius / 2]
+        errors.append(outlines(inside[None].astype(np.int32)).support[0, 0] - true)
+    bias = np.mean(errors, 0)
+    assert abs(bias.mean()) < 0.08
+    assert np.abs(bias).max() < 0.25
