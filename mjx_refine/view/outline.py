@@ -107,9 +107,7 @@ def place(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]) -> 
 def corners(placed: Placed, n: int) -> Float[Array, "batch frames 8 2"]:
     """Box ``n``'s corners in the picture, from the principal point [px]."""
     signs = jnp.asarray(CORNERS, placed.size.dtype) * placed.size[:, :, n, None]
-    x, y, depth = (
-        (placed.axes[:, :, n, None, i] * signs).sum(-1) + placed.shown[:, :, n, None, i] for i in range(3)
-    )
+    x, y, depth = ((placed.axes[:, :, n, None, i] * signs).sum(-1) + placed.shown[:, :, n, None, i] for i in range(3))
     scale = placed.focal / jnp.maximum(depth, 0.25 * NEAR)
     return jnp.stack([scale * x, scale * y], -1)
 

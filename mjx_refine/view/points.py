@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,13 +9,15 @@ from jaxtyping import Array, Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.scene import Shape
+from mjx_refine.view.distance import surface
 from mjx_refine.view.frames import make_frames
-from mjx_refine.view.outline import BATCHES
-from mjx_refine.view.rays import FAR, HIT
+from mjx_refine.view.outline import BATCHES, Arrays
 
 
-@functools.partial(jax.jit, static_argnames=("shapes", "image"))
-def _point_flow(shapes: tuple[Shape, ...], arrays, pixels: Array, image: tuple[int, int]):
+def point_flow_function(
+    shapes: tuple[Shape, ...], arrays: Arrays, pixels: Float[Array, "frames objects points 2"], image: tuple[int, int]
+) -> Float[Array, "batch frames objects points 2"]:
+    """``point_flow`` as a pure function of poses, sizes and cameras; its derivatives are finite everywhere."""
     poses, size, position, pitch, fovy = arrays
     batch, length = poses.shape[:2]
     frames = make_frames(poses, size, position, pitch, fovy, image[1])
@@ -30,16 +30,18 @@ def _point_flow(shapes: tuple[Shape, ...], arrays, pixels: Array, image: tuple[i
         ray, origin, extent = frames.ray[:, n], frames.origin[:, n], frames.size[:, n]
         d = tuple(ray[:, i, 0, None] * u + ray[:, i, 1, None] * v - ray[:, i, 2, None] for i in range(3))
         o = tuple(origin[:, i, None] for i in range(3))
-        t = HIT[shape](o, d, tuple(extent[:, i, None] for i in range(3)))
         # A ray that misses takes the point beside the object that is as far away as its centre.
-        beside = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / (d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-        t = jnp.where(t < FAR, t, beside)
+        near, beside, seen = surface(shape, o, d, tuple(extent[:, i, None] for i in range(3)))
+        t = jnp.where(seen, near, beside)
         hit = tuple(oi + t * di for oi, di in zip(o, d, strict=True))
         matrix, offset = frames.next_matrix[:, n], frames.next_offset[:, n]
         cx, cy, cz = (sum(matrix[:, i, j, None] * hit[j] for j in range(3)) + offset[:, i, None] for i in range(3))
         depth = jnp.maximum(-cz, 0.02)
         result.append(jnp.stack([focal * cx / depth + image[0] / 2 - x, -focal * cy / depth + image[1] / 2 - y], -1))
     return jnp.stack(result, 1).reshape(batch, length, len(shapes), -1, 2)
+
+
+_point_flow = jax.jit(point_flow_function, static_argnums=(0, 3))
 
 
 def point_flow(
