@@ -22,6 +22,7 @@ LAYERS = (
     {"scene"},
     {"batch", "observation", "compile_cache"},
     {"sim", "view", "space"},
+    {"gradients"},
     {"search"},
     {"simulate", "evaluate", "export", "observe", "guess"},
     {"report"},
