@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mjx_refine.scene import Shape
-from mjx_refine.view.outline import CORNERS, Arrays, Placed, corners, directions, place, support_of
+from mjx_refine.view.outline import CORNERS, Arrays, Placed, corners, directions, larger, place, smaller, support_of
 
 _Vector = tuple[Array, ...]
 
@@ -21,7 +21,7 @@ EDGES = tuple(
 def _unit(x: Array, y: Array) -> Array:
     """Unit vectors; one of no length becomes a constant."""
     square = x * x + y * y
-    length = jnp.sqrt(jnp.maximum(square, 1e-20))
+    length = jnp.sqrt(larger(square, 1e-20))
     still = square <= 1e-20
     return jnp.stack([jnp.where(still, 1.0, x / length), jnp.where(still, 0.0, y / length)], -1)
 
@@ -41,7 +41,7 @@ def rulings(placed: Placed, n: int) -> tuple[Array, Array, Array]:
     camera = -(axes[..., :2] * centre[..., :, None]).sum(-2)
     u = _unit(camera[..., 0], camera[..., 1])
     far = jnp.sqrt((camera**2).sum(-1) + 1e-12)
-    cosine = jnp.minimum(placed.size[:, :, n, 0] / far, 1 - 1e-6)
+    cosine = smaller(placed.size[:, :, n, 0] / far, 1 - 1e-6)
     return u, jnp.stack([-u[..., 1], u[..., 0]], -1), cosine
 
 
@@ -67,8 +67,8 @@ def _rim_normals(placed: Placed, n: int, count: int) -> Array:
 def normals_of(shape: Shape, placed: Placed, n: int, count: int) -> Float[Array, "batch frames directions 2"]:
     """Outline normals that describe object ``n``'s silhouette: its straight edges exactly, its arcs closely.
 
-    A sphere has ``count`` evenly spaced ones; a box those and both normals of its twelve edges; a cylinder ``count`` for
-    each rim and both normals of the two rulings that the view touches.
+    ``count`` evenly spaced ones, and for a box both normals of its twelve edges, for a cylinder half as many for each rim
+    and both normals of the two rulings that the view touches.
     """
     even = jnp.asarray(directions(count), placed.centre.dtype)
     even = jnp.broadcast_to(even, (*placed.centre.shape[:2], count, 2))
@@ -87,7 +87,7 @@ def normals_of(shape: Shape, placed: Placed, n: int, count: int) -> Float[Array,
         # The plane that touches the side along a ruling goes through the camera: its normal is the picture's too.
         x, y = ((placed.axes[:, :, n, i, :2] * radial).sum(-1) for i in range(2))
         sides.append(_unit(x, y))
-    return jnp.concatenate([_rim_normals(placed, n, count), _both(jnp.stack(sides, -2))], -2)
+    return jnp.concatenate([even, _rim_normals(placed, n, -(-count // 2)), _both(jnp.stack(sides, -2))], -2)
 
 
 def distance_of(
@@ -98,7 +98,10 @@ def distance_of(
     reach = support_of(shape, placed, n, normals)
     x, y = pixels[:, 0, None], pixels[:, 1, None]
     along = x * normals[..., None, :, 0] + y * normals[..., None, :, 1]
-    return (along - reach[..., None, :]).max(-1)
+    # Which normal has no derivative; what it gives has: nothing as large as ``along`` is kept for reverse mode.
+    chosen = (along - reach[..., None, :]).argmax(-1)
+    nx, ny, h = (jnp.take_along_axis(a, chosen, -1) for a in (normals[..., 0], normals[..., 1], reach))
+    return pixels[:, 0] * nx + pixels[:, 1] * ny - h
 
 
 def signed_distance(
@@ -143,7 +146,7 @@ def _sphere(o: _Vector, d: _Vector, size: _Vector) -> tuple[Array, Array]:
     px, py, pz = (oi + along * di for oi, di in zip(o, d, strict=True))
     square = size[0] * size[0]
     gap = square - (px * px + py * py + pz * pz)
-    return along - jnp.sqrt(jnp.maximum(gap, TANGENT * square + 1e-12) / dd), gap > 0.0
+    return along - jnp.sqrt(larger(gap, TANGENT * square + 1e-12) / dd), gap > 0.0
 
 
 def _box(o: _Vector, d: _Vector, size: _Vector) -> tuple[Array, Array]:
@@ -153,7 +156,7 @@ def _box(o: _Vector, d: _Vector, size: _Vector) -> tuple[Array, Array]:
         middle, half = -oi * inverse, si * jnp.abs(inverse)
         nears.append(middle - half)
         fars.append(middle + half)
-    near, far = functools.reduce(jnp.maximum, nears), functools.reduce(jnp.minimum, fars)
+    near, far = functools.reduce(larger, nears), functools.reduce(smaller, fars)
     return near, near < far
 
 
@@ -163,11 +166,11 @@ def _cylinder(o: _Vector, d: _Vector, size: _Vector) -> tuple[Array, Array]:
     along = -(o[0] * d[0] + o[1] * d[1]) / across
     px, py = o[0] + along * d[0], o[1] + along * d[1]
     gap = square - (px * px + py * py)
-    reach = jnp.sqrt(jnp.maximum(gap, TANGENT * square + 1e-12) / across)
+    reach = jnp.sqrt(larger(gap, TANGENT * square + 1e-12) / across)
     inverse = 1.0 / _safe(d[2])
     middle, width = -o[2] * inverse, size[1] * jnp.abs(inverse)
-    near = jnp.maximum(along - reach, middle - width)
-    return near, (gap > 0.0) & (near < jnp.minimum(along + reach, middle + width))
+    near = larger(along - reach, middle - width)
+    return near, (gap > 0.0) & (near < smaller(along + reach, middle + width))
 
 
 _HIT = {"sphere": _sphere, "box": _box, "cylinder": _cylinder}
@@ -186,4 +189,4 @@ def surface(
     dd = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
     beside = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / dd
     bound = jnp.sqrt((size[0] * size[0] + size[1] * size[1] + size[2] * size[2] + 1e-12) / dd)
-    return jnp.clip(near, beside - bound, beside + bound), beside, hit & (near > 0.0)
+    return smaller(larger(near, beside - bound), beside + bound), beside, hit & (near > 0.0)

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from mjx_refine.scene import Shape
 from mjx_refine.view.distance import rulings
-from mjx_refine.view.outline import NEAR, Arrays, Placed, corners, place
+from mjx_refine.view.outline import NEAR, Arrays, Placed, corners, larger, place
 
 # Corners of faces, clockwise from outside: in the picture, where y points down, a visible face then has positive area.
 FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
@@ -62,7 +62,7 @@ def _segments(start: Array, end: Array) -> Array:
     return (_power(x0, y0, cross) + 4 * middle + _power(x1, y1, cross)) / 6
 
 
-def _of_ellipse(area: Array, centre: Array, second: Array) -> Array:
+def _of_ellipse(area: Array, centre: Array, second: tuple[Array, Array, Array]) -> Array:
     """Integrals over an ellipse; ``second`` is its covariance as (xx, xy, yy)."""
     x, y = centre[..., 0], centre[..., 1]
     terms = [jnp.ones_like(x), x, y, second[0] + x * x, second[1] + x * y, second[2] + y * y]
@@ -94,7 +94,7 @@ def _cap(placed: Placed, n: int, sign: int, reference: Array) -> Array:
     ax, ay, ad = (axis[..., i] for i in range(3))
     leading = md * md - square * (ax * ax + ay * ay)
     facing = -(ax * mx + ay * my + ad * md)
-    area = jnp.pi * square * focal * focal * jnp.maximum(facing, 0.0) / (leading * jnp.sqrt(leading))
+    area = jnp.pi * square * focal * focal * larger(facing, 0.0) / (leading * jnp.sqrt(leading))
     middle = [focal * (m * md + square * a * ad) / leading for m, a in ((mx, ax), (my, ay))]
     # The discriminant of ``outline._rim`` as a quadratic form in the direction across n.
     cx, cy = my * ad - md * ay, md * ax - mx * ad
@@ -120,7 +120,7 @@ def _side(placed: Placed, n: int, reference: Array) -> Array:
     total, ends = [], {}
     for sign in (1, -1):
         point = (centre + sign * size[..., 1, None] * axes[..., 2])[..., None, :] + spoke
-        depth = jnp.maximum(point[..., 2], 0.25 * NEAR)
+        depth = larger(point[..., 2], 0.25 * NEAR)
         raw = [focal * point[..., i] / depth for i in range(2)]
         x, y = (raw[i] - reference[..., None, i] for i in range(2))
         dx, dy = ((focal * tangent[..., i] - raw[i] * tangent[..., 2]) / depth for i in range(2))
@@ -154,7 +154,7 @@ def moments_of(shapes: tuple[Shape, ...], placed: Placed, image: tuple[int, int]
             sums = _box(placed, n, reference)
         else:
             sums = _side(placed, n, reference) + _cap(placed, n, 1, reference) + _cap(placed, n, -1, reference)
-        mean = sums[..., 1:] / jnp.maximum(sums[..., :1], LEAST_AREA)
+        mean = sums[..., 1:] / larger(sums[..., :1], LEAST_AREA)
         x, y = mean[..., 0], mean[..., 1]
         xx, xy, yy = mean[..., 2] - x * x, mean[..., 3] - x * y, mean[..., 4] - y * y
         second = jnp.stack([jnp.stack([xx, xy], -1), jnp.stack([xy, yy], -1)], -2)

@@ -65,6 +65,17 @@ def directions(count: int) -> Float[np.ndarray, "directions 2"]:
     return np.stack([np.cos(angle), np.sin(angle)], -1)
 
 
+def larger(a: Array, b: Array | float) -> Array:
+    """The larger of two, elementwise. The derivative of ``jnp.maximum`` asks which operand equals the result; XLA may
+    compute the two with different rounding, and none does."""
+    return jnp.where(a > b, a, b)
+
+
+def smaller(a: Array, b: Array | float) -> Array:
+    """Ditto, the smaller."""
+    return jnp.where(a < b, a, b)
+
+
 def camera_axes(pitch: Float[Array, "batch"]) -> Float[Array, "batch 3 3"]:
     """The picture's right, down and ahead in the world, as columns."""
     return camera_matrix(pitch) * jnp.asarray([1.0, -1.0, -1.0], pitch.dtype)
@@ -72,7 +83,7 @@ def camera_axes(pitch: Float[Array, "batch"]) -> Float[Array, "batch 3 3"]:
 
 def _ahead(nearest: Array) -> Array:
     """Depth of the nearest point of the object as it is shown: once differentiable, between NEAR / 2 and NEAR behind."""
-    lack = jnp.maximum(NEAR - nearest, 0.0) / NEAR
+    lack = larger(NEAR - nearest, 0.0) / NEAR
     return 0.5 * NEAR * (1.0 + 1.0 / (1.0 + 2.0 * lack))
 
 
@@ -108,7 +119,7 @@ def corners(placed: Placed, n: int) -> Float[Array, "batch frames 8 2"]:
     """Box ``n``'s corners in the picture, from the principal point [px]."""
     signs = jnp.asarray(CORNERS, placed.size.dtype) * placed.size[:, :, n, None]
     x, y, depth = ((placed.axes[:, :, n, None, i] * signs).sum(-1) + placed.shown[:, :, n, None, i] for i in range(3))
-    scale = placed.focal / jnp.maximum(depth, 0.25 * NEAR)
+    scale = placed.focal / larger(depth, 0.25 * NEAR)
     return jnp.stack([scale * x, scale * y], -1)
 
 
@@ -127,7 +138,7 @@ def _rim(centre: Array, axis: Array, radius: Array, nx: Array, ny: Array) -> Arr
     leading = md * md - square * (ax * ax + ay * ay)
     inner = across * across * (beside * beside + md * md - square) + (lean * beside + ad * md) ** 2
     # Seen edge on, a circle has a corner; a millionth of its radius rounds it.
-    root = jnp.sqrt(jnp.maximum(inner, 0.0) + 1e-12 * md * md)
+    root = jnp.sqrt(larger(inner, 0.0) + 1e-12 * md * md)
     return (beside * md + square * lean * ad + radius * root) / leading
 
 
@@ -155,11 +166,11 @@ def support_of(shape: Shape, placed: Placed, n: int, normals: Array) -> Float[Ar
     if shape == "cylinder":
         half = size[..., 1, None] * axis
         ends = (_rim(centre + sign * half, axis, size[..., 0], nx, ny) for sign in (1, -1))
-        return placed.focal * functools.reduce(jnp.maximum, ends)
+        return placed.focal * functools.reduce(larger, ends)
     points = corners(placed, n)
     # Corner by corner: nothing of the size corners times directions is written to memory.
     reach = (points[:, :, k, 0, None] * nx + points[:, :, k, 1, None] * ny for k in range(8))
-    return functools.reduce(jnp.maximum, reach)
+    return functools.reduce(larger, reach)
 
 
 def support_function(

@@ -11,7 +11,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.scene import Shape
 from mjx_refine.view.distance import surface
 from mjx_refine.view.frames import make_frames
-from mjx_refine.view.outline import BATCHES, Arrays
+from mjx_refine.view.outline import BATCHES, Arrays, larger
 
 
 def point_flow_function(
@@ -36,7 +36,7 @@ def point_flow_function(
         hit = tuple(oi + t * di for oi, di in zip(o, d, strict=True))
         matrix, offset = frames.next_matrix[:, n], frames.next_offset[:, n]
         cx, cy, cz = (sum(matrix[:, i, j, None] * hit[j] for j in range(3)) + offset[:, i, None] for i in range(3))
-        depth = jnp.maximum(-cz, 0.02)
+        depth = larger(-cz, 0.02)
         result.append(jnp.stack([focal * cx / depth + image[0] / 2 - x, -focal * cy / depth + image[1] / 2 - y], -1))
     return jnp.stack(result, 1).reshape(batch, length, len(shapes), -1, 2)
 

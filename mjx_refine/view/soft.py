@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from mjx_refine.scene import Shape
 from mjx_refine.view.distance import distance_of, surface
 from mjx_refine.view.moments import LEAST_AREA, Moments, moments_of
-from mjx_refine.view.outline import NEAR, Arrays, Placed, camera_axes, directions, place, support_of
+from mjx_refine.view.outline import NEAR, Arrays, Placed, camera_axes, directions, larger, place, support_of
 from mjx_refine.view.points import point_flow_function
 
 PIXEL_VARIANCE = 1 / 12
@@ -36,10 +36,10 @@ def _inverse_depths(shapes: tuple[Shape, ...], placed: Placed, u: Array, v: Arra
         axes = placed.axes[:, :, n, :, :, None]
         centre = placed.centre[:, :, n, :, None]
         d = tuple(axes[:, :, 0, j] * u + axes[:, :, 1, j] * v + axes[:, :, 2, j] for j in range(3))
-        o = tuple(-sum(axes[:, :, i, j] * centre[:, :, i] for i in range(3)) for j in range(3))
+        o = tuple(-(axes[:, :, :, j] * centre).sum(2) for j in range(3))
         size = tuple(jnp.broadcast_to(placed.size[:, :, n, i, None], d[0].shape) for i in range(3))
         t, _, hit = surface(shape, o, d, size)
-        inverse.append(1.0 / jnp.maximum(t, 0.25 * NEAR))
+        inverse.append(1.0 / larger(t, 0.25 * NEAR))
         hits.append(hit)
     return jnp.stack(inverse, 2), jnp.stack(hits, 2)
 
@@ -83,8 +83,8 @@ def soft_masks(
 
     down = camera_axes(arrays[3])[:, 2]
     height = arrays[2][:, 2, None, None]
-    falling = jnp.maximum(-(down[:, 0, None, None] * u + down[:, 1, None, None] * v + down[:, 2, None, None]), 0.0)
-    floor = jnp.where(height > 0, falling / jnp.maximum(height, 1e-6), 0.0)
+    falling = larger(-(down[:, 0, None, None] * u + down[:, 1, None, None] * v + down[:, 2, None, None]), 0.0)
+    floor = jnp.where(height > 0, falling / larger(height, 1e-6), 0.0)
     objects = range(len(shapes))
     cover = jnp.stack([cover[:, :, k] * in_front(inverse[:, :, k], floor) for k in objects], 2)
 
@@ -147,19 +147,19 @@ class Residuals:
 
 
 def _radius(area: Array) -> Array:
-    return jnp.sqrt(jnp.maximum(area, LEAST_AREA) / jnp.pi)
+    return jnp.sqrt(larger(area, LEAST_AREA) / jnp.pi)
 
 
 def _spread(second: Array) -> Array:
     """Cholesky factor with a pixel's own variance added, which keeps it regular for slivers."""
-    xx = jnp.maximum(second[..., 0, 0], 0.0) + PIXEL_VARIANCE
+    xx = larger(second[..., 0, 0], 0.0) + PIXEL_VARIANCE
     first = jnp.sqrt(xx)
     off = second[..., 1, 0] / first
     rest = second[..., 1, 1] - off * off
-    return jnp.stack([first, off, jnp.sqrt(jnp.maximum(rest, 0.0) + PIXEL_VARIANCE)], -1)
+    return jnp.stack([first, off, jnp.sqrt(larger(rest, 0.0) + PIXEL_VARIANCE)], -1)
 
 
-def _difference(simulated: Array, seen: Array) -> Array:
+def _difference(simulated: Array, seen: Array | np.ndarray) -> Array:
     known = jnp.isfinite(seen)
     return jnp.where(known, simulated - jnp.where(known, seen, 0.0), 0.0)
 
@@ -193,5 +193,5 @@ def residuals(shapes: tuple[Shape, ...], arrays: Arrays, seen: Features, image: 
         ),
         centroid=_difference(simulated.centroid, seen.moments.centroid),
         spread=jnp.where(known[..., 0], _spread(simulated.second) - spread, 0.0),
-        flow=_difference(point_flow_function(shapes, arrays, seen.pixels, image), seen.flow),
+        flow=_difference(point_flow_function(shapes, arrays, jnp.asarray(seen.pixels), image), seen.flow),
     )
