@@ -47,7 +47,8 @@ class Verdict:
       wide: cosine between differences of 0.1 and 0.01 prior widths.
       autodiff_parts: first frame from which automatic derivatives disagree; the number of frames where they never do.
       differences_part: first frame from which the wide differences disagree; ditto.
-      kinks: parameters in which the scene itself has no derivative at this point.
+      kinks: parameters in which the scene itself has no derivative at this point (a flat box rises whichever way it is
+        tilted); the rest of the verdict leaves them out.
     """
 
     method: Method
@@ -133,16 +134,17 @@ def check(
     simulator = simulator or MujocoSimulator(space.scene.shapes, fps)
     if autodiff is not None and simulator.fps != fps:
         raise ValueError(f"{simulator.fps} frames a second in MuJoCo, {fps} in MJX; expected the same")
-    wide, middle, narrow = (differences(space, point, frames, step, simulator, image) for step in STEPS)
+    kinks = kinked(space, point)
+    wide, middle, narrow = (differences(space, point, frames, step, simulator, image)[~kinks] for step in STEPS)
     along, problem = None, ""
     if autodiff is not None:
         try:
             slopes = autodiff.outlines(point, frames, image, DIRECTIONS)[1] * space.sigma[:, None, None, None]
-            along = np.minimum(cosines(slopes, middle), cosines(slopes, narrow))
+            along = np.minimum(cosines(slopes[~kinks], middle), cosines(slopes[~kinks], narrow))
         except DerivativeError as error:
             problem = str(error)
-    kinks = tuple(np.array(space.names)[kinked(space, point)].tolist())
-    return _judge(along, cosines(middle, narrow), cosines(wide, middle), kinks, problem)
+    names = tuple(np.array(space.names)[kinks].tolist())
+    return _judge(along, cosines(middle, narrow), cosines(wide, middle), names, problem)
 
 
 def _parts(cosine: np.ndarray) -> int:

@@ -17,9 +17,9 @@ def require_finite(values: np.ndarray, derivatives: np.ndarray, names: tuple[str
     """
     if not np.isfinite(values).all():
         raise DerivativeError(f"the rollout or its view is not finite{_since(values)}; expected a scene that is stable")
-    bad = ~np.isfinite(derivatives.reshape(len(names), -1)).all(1)
+    bad = np.logical_not(np.isfinite(derivatives.reshape(len(names), -1)).all(1)).reshape(-1)
     if bad.any():
-        which = ", ".join(name for name, wrong in zip(names, bad, strict=True) if wrong)
+        which = ", ".join(name for name, wrong in zip(names, bad.tolist(), strict=True) if wrong)
         since = _since(derivatives[bad].swapaxes(0, 1)) if derivatives.ndim > 1 else ""
         raise DerivativeError(f"the derivative in {which} is not finite{since}; use differences or a population here")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -22,7 +22,8 @@ KINK = 1e-3
 
 
 class Inputs(NamedTuple):
-    """Everything that a rollout and its view depend on, for one candidate with N objects (a batch: a leading axis).
+    """Everything that a rollout and its view depend on, for one candidate with N objects (a batch: a leading axis);
+    arrays of numpy or of JAX.
 
     Attributes:
       leaves: the model's fields.
@@ -35,12 +36,12 @@ class Inputs(NamedTuple):
     """
 
     leaves: Leaves
-    qpos: np.ndarray | jax.Array
-    qvel: np.ndarray | jax.Array
-    size: np.ndarray | jax.Array
-    camera_position: np.ndarray | jax.Array
-    camera_pitch: np.ndarray | jax.Array
-    camera_fovy: np.ndarray | jax.Array
+    qpos: Any
+    qvel: Any
+    size: Any
+    camera_position: Any
+    camera_pitch: Any
+    camera_fovy: Any
 
 
 def inputs_of(batch: SceneBatch) -> Inputs:

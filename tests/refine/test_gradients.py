@@ -7,13 +7,14 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
 from mjx_refine.gradients import DerivativeError, Differentiator, check
 from mjx_refine.gradients.check import Verdict, cosines, differences
 from mjx_refine.gradients.finite import require_finite
-from mjx_refine.gradients.implicit import implicit_solver
+from mjx_refine.gradients.steps import differentiable_steps, quat_integrate
 from mjx_refine.gradients.tangents import inputs_of, kinked, stencil, tangents
 from mjx_refine.scene import Body, Camera, Scene
 from mjx_refine.sim.c import MujocoSimulator
@@ -29,6 +30,7 @@ ROLLING = dataclasses.replace(
     FLYING, position=(0.0, 0.0, 0.2), linear_velocity=(2.0, 0.0, 0.0), angular_velocity=(0.0, 10.0, 0.0), damping=-40.0
 )
 FLAT = Body("box", "b", (0.25, 0.2, 0.15), (0, 0, 0.15), (1, 0, 0, 0), (3.0, 0.5, 0.0), (0.0, 0.0, 1.0), damping=-40.0)
+RESTING = dataclasses.replace(ROLLING, linear_velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0))
 TURN = (0.9, 0.1, 0.3, 0.3)
 UNIT = tuple((np.array(TURN) / np.linalg.norm(TURN)).tolist())
 TUMBLING = dataclasses.replace(FLAT, position=(0.0, 0.0, 1.5), orientation=UNIT, angular_velocity=(1.0, 3.0, 0.5))
@@ -128,6 +130,7 @@ def slopes(body: Body) -> tuple[Space, np.ndarray]:
     [
         (FLYING, 1e-4),
         (ROLLING, 1e-3),
+        (RESTING, 1e-3),
         pytest.param(TUMBLING, 1e-4, marks=pytest.mark.slow),
     ],
 )
@@ -136,7 +139,9 @@ def test_outlines_have_the_derivatives_of_double_precision(body, limit):
     truth = differences(space, space.start, FRAMES, 1e-5, reference(body.shape), IMAGE)
     error = relative(columns, truth)
     # A lift off the floor, where the contact starts, is no smooth change: its differences jump.
-    smooth = np.array([body is not ROLLING or not name.endswith(("clearance", "damping")) for name in space.names])
+    smooth = np.array(
+        [body is FLYING or body is TUMBLING or not name.endswith(("clearance", "damping")) for name in space.names]
+    )
     assert error[smooth].max() <= limit, dict(zip(space.names, error.tolist(), strict=True))
 
 
@@ -238,12 +243,29 @@ def test_another_scene_kind_is_refused():
 
 
 def test_the_solver_is_put_back():
-    from mujoco.mjx._src import solver
+    from mujoco.mjx._src import math, solver
 
-    before = solver.solve
-    with implicit_solver():
-        assert solver.solve is not before
-    assert solver.solve is before
+    before = solver.solve, math.quat_integrate
+    with differentiable_steps():
+        assert solver.solve is not before[0]
+        assert math.quat_integrate is not before[1]
+    assert (solver.solve, math.quat_integrate) == before
+
+
+@pytest.mark.parametrize("speed", [0.0, 1e-9, 1e-3, 0.4, 0.5, 30.0, 1e3])
+def test_the_turn_is_mujocos_and_has_derivatives_also_at_rest(speed):
+    q, v, dt = np.array(UNIT), speed * np.array([0.6, -0.64, 0.48]), 1 / 240
+    expected = q.copy()
+    mujoco.mju_quatIntegrate(expected, v, dt)
+    with jax.enable_x64(True):
+        turned = quat_integrate(jnp.asarray(q), jnp.asarray(v), jnp.asarray(dt))
+        slope = jax.jacobian(quat_integrate, 1)(jnp.asarray(q), jnp.asarray(v), jnp.asarray(dt))
+    np.testing.assert_allclose(turned, expected, atol=1e-12)
+    for k, unit in enumerate(np.eye(3)):
+        ends = [q.copy(), q.copy()]
+        for end, sign in zip(ends, (1, -1), strict=True):
+            mujoco.mju_quatIntegrate(end, v + sign * 1e-4 * unit, dt)
+        np.testing.assert_allclose(slope[:, k], (ends[0] - ends[1]) / 2e-4, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -266,7 +288,7 @@ def test_implicit_derivatives_are_those_of_a_converged_solver():
             return jax.vmap(lambda move: jax.jvp(trajectory, (values,), (move,))[1])(along)
 
         loop = np.asarray(jax.jit(push)(inputs, moves))
-        with implicit_solver():
+        with differentiable_steps():
             implicit = np.asarray(jax.jit(lambda a, b: push(a, b))(inputs, moves))
     np.testing.assert_allclose(implicit, loop, atol=1e-6 * np.abs(loop).max())
 
