@@ -94,7 +94,9 @@ def place(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]) -> 
     offset = poses[..., :3] - position[:, None, None]
     # Written out: a batched matrix product of this size is slow on every device.
     centre = (camera * offset[..., :, None]).sum(-2)
-    axes = (camera[..., :, :, None] * rotation_matrix(poses[..., 3:])[..., :, None, :]).sum(-3)
+    # What follows is consistent for rotations only; a step along a derivative leaves the unit quaternions.
+    norm = jnp.sqrt(larger((poses[..., 3:] ** 2).sum(-1, keepdims=True), 1e-12))
+    axes = (camera[..., :, :, None] * rotation_matrix(poses[..., 3:] / norm)[..., :, None, :]).sum(-3)
     extent = jnp.broadcast_to(size[:, None], centre.shape)
     reaches = []
     for n, shape in enumerate(shapes):
