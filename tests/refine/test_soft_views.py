@@ -320,20 +320,23 @@ def test_wide_masks_add_up_and_hide():
 
 @EACH
 def test_moments_are_those_of_drawn_masks(shape):
-    batch, poses = scenes((shape,), 180, 3)
+    batch, poses = scenes((shape,), 100, 3)
     found = jax.jit(lambda a: moments((shape,), a, LARGE))(arrays_of(batch, poses))
-    compared = 0
+    off = []
     for row in range(len(poses)):
         seen = mask_moments(draw(poses[row], batch, LARGE, row)[0][:1], (1,))
-        # Counting pixels is itself wrong, worst for slivers.
-        if not seen.area[0, 0] > 1500 or np.linalg.eigvalsh(seen.second[0, 0])[0] < 200:
+        if not seen.area[0, 0] > 1500:
             continue
-        compared += 1
         assert float(found.area[row, 0, 0]) == pytest.approx(float(seen.area[0, 0]), rel=0.01)
-        np.testing.assert_allclose(found.centroid[row, 0, 0], seen.centroid[0, 0], atol=0.1)
-        second = np.asarray(seen.second[0, 0])
-        np.testing.assert_allclose(found.second[row, 0, 0], second, atol=0.015 * np.trace(second))
-    assert compared >= 15
+        off.append(np.abs(found.centroid[row, 0, 0] - seen.centroid[0, 0]).max())
+        # Counting pixels is itself wrong by up to 0.15 px where an edge runs along them: finer ones decide.
+        fine = mask_moments(draw(poses[row, :1], batch, (4 * LARGE[0], 4 * LARGE[1]), row)[0], (1,))
+        assert float(found.area[row, 0, 0]) == pytest.approx(float(fine.area[0, 0]) / 16, rel=0.004)
+        np.testing.assert_allclose(found.centroid[row, 0, 0], np.asarray(fine.centroid[0, 0]) / 4, atol=0.05)
+        second = np.asarray(fine.second[0, 0]) / 16
+        np.testing.assert_allclose(found.second[row, 0, 0], second, atol=0.004 * np.trace(second))
+    assert len(off) >= 12
+    assert np.percentile(off, 90) < 0.1
 
 
 @EACH
