@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_refine.gradients.differentiator import CHUNK, look, pull, push
+from mjx_refine.gradients.differentiator import CHUNK, compiler_options, look, pull, push
 from mjx_refine.gradients.tangents import tangents
 from mjx_refine.gradients.views import flow_view, outline_view
 from mjx_refine.scene import Body, Camera, Scene
@@ -106,8 +106,9 @@ def _programs(simulator: MjxSimulator, reverse: bool):
 
         return pull(simulator, FRAMES, loss, inputs, ())[1]
 
-    programs = [jax.jit(lambda inputs, moves: jax.lax.map(lambda pair: forward(*pair), (inputs, moves)))]
-    return programs + ([jax.jit(lambda inputs: jax.lax.map(backward, inputs))] if reverse else [])
+    options = compiler_options()
+    both = jax.jit(lambda i, m: jax.lax.map(lambda pair: forward(*pair), (i, m)), compiler_options=options)
+    return [both, jax.jit(lambda i: jax.lax.map(backward, i), compiler_options=options)] if reverse else [both]
 
 
 def hunt(count: int, reverse: bool, seed: int = 0) -> int:

@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -29,7 +30,7 @@ View = Callable[..., Any]
 """A JAX function of (poses (T, N, 7), size (N, 3), camera_position (3,), camera_pitch (), camera_fovy (), *data)."""
 
 CHUNK = 16
-"""Tangents that are pushed through one rollout at a time; on a CPU, XLA takes 40 times as long for 32."""
+"""Tangents that are pushed through one rollout at a time."""
 
 PROGRAMS = 32
 """Compiled programs that are kept."""
@@ -38,12 +39,22 @@ HORIZONS = (1, 8, 16, 32, 64)
 """Lengths [frames] that physics is compiled for; beyond, multiples of the last."""
 
 
+def compiler_options() -> dict[str, str | bool]:
+    """How XLA compiles derivatives. On a CPU, its small matrix products are slower by 5 to 40 times in several threads."""
+    return {"xla_cpu_multi_thread_eigen": False} if jax.default_backend() == "cpu" else {}
+
+
+def _trajectory(simulator: MjxSimulator, frames: int, inputs: Inputs) -> Array:
+    """One candidate's poses. Friction has C MuJoCo's floor: MJX's own is 1e-15, and its square drowns in float32."""
+    friction = jnp.maximum(inputs.leaves.pair_friction, mujoco.mjMINMU)
+    leaves = inputs.leaves._replace(pair_friction=friction)
+    return simulator.trajectory(leaves, inputs.qpos, inputs.qvel, frames)
+
+
 def push(simulator: MjxSimulator, frames: int, inputs: Inputs, moves: Inputs) -> tuple[Array, Array]:
     """One candidate's poses and their derivatives along each of ``moves`` (leading axis); pure, for any transform."""
 
-    def trajectory(values: Inputs) -> Array:
-        return simulator.trajectory(values.leaves, values.qpos, values.qvel, frames)
-
+    trajectory = functools.partial(_trajectory, simulator, frames)
     with differentiable_steps():
         return jax.vmap(lambda move: jax.jvp(trajectory, (inputs,), (move,)), out_axes=(None, 0))(moves)
 
@@ -52,8 +63,7 @@ def pull(simulator: MjxSimulator, frames: int, loss: View, inputs: Inputs, data:
     """(loss, its derivatives in the inputs), by reverse mode; pure."""
 
     def value(values: Inputs) -> Array:
-        poses = simulator.trajectory(values.leaves, values.qpos, values.qvel, frames)
-        return loss(poses, *_rest(values), *data)
+        return loss(_trajectory(simulator, frames, values), *_rest(values), *data)
 
     with differentiable_steps():
         return jax.value_and_grad(value)(inputs)
@@ -226,5 +236,5 @@ class Differentiator:
                 del self._programs[next(iter(self._programs))]
             # Views compile in a second or two: nothing to announce.
             with compiling(what) if what else contextlib.nullcontext():
-                self._programs[key] = jax.jit(body).lower(*arguments).compile()
+                self._programs[key] = jax.jit(body).lower(*arguments).compile(compiler_options())
         return self._programs[key](*arguments)

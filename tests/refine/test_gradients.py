@@ -216,6 +216,13 @@ def test_derivatives_of_random_scenes_are_numbers():
         assert np.isfinite(columns).all()
 
 
+@pytest.mark.parametrize("body", [ROLLING, FLYING])
+def test_derivatives_without_friction_are_numbers(body):
+    space = space_of(dataclasses.replace(body, friction=(0.0, 0.0)))
+    columns = Differentiator(space, simulator("sphere")).outlines(space.start, FRAMES, IMAGE)[1]
+    assert np.isfinite(columns).all()
+
+
 def test_what_is_not_a_number_is_told():
     space = space_of(FLYING)
     derivatives = Differentiator(space, simulator("sphere"))
