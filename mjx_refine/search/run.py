@@ -37,6 +37,10 @@ spread where the landing left a parameter open). More, and contacts beyond those
 WIDE = (4.0, 0.2)
 """The same after a poor landing, which the population search must leave again."""
 
+GENERATIONS = 40
+"""Generations for which the budget after a landing must suffice; the population shrinks, down to CMA-ES's default
+4 + 3 ln n (Hansen, The CMA Evolution Strategy: A Tutorial, 2023, table 1), until it does."""
+
 ELITES = 8
 """Candidates of the search that are compared at full resolution in the end."""
 
@@ -216,9 +220,10 @@ class Run:
     def _search(self, objective: Objective, mean: np.ndarray, covariance: np.ndarray):
         """Generations until the budget is spent; returns (reason, points for the finish)."""
         left = self.options.budget - self.evaluations if self._saved is None else 0
-        settings = mjx_cmaes.Settings(dimension=len(mean), population=self.options.population)
+        population = self._population(len(mean), left)
+        settings = mjx_cmaes.Settings(dimension=len(mean), population=population)
         if self._saved is None:
-            if left < self.options.population:
+            if left < population:
                 return "The budget of rollouts was spent by least squares.", []
             state = mjx_cmaes.init(settings, mean, covariance=covariance, seed=self.options.seed)
             elites, elite_costs = mean[None], np.full(1, np.inf)
@@ -229,7 +234,7 @@ class Run:
                 elites, elite_costs = arrays["elites"], arrays["elite_costs"]
             except (KeyError, ValueError, TypeError) as error:
                 raise damaged(Path(self.path or ""), error) from error
-        while self.evaluations + self.options.population <= self.options.budget:
+        while self.evaluations + population <= self.options.budget:
             reason = mjx_cmaes.should_stop(settings, state)
             if reason is not None:
                 return str(reason), [state.mean, *elites]
@@ -244,9 +249,18 @@ class Run:
                 self._best = (-float(costs[best]), float(scores.iou[best]), float(scores.epe[best]))
             self._step("search", self._best, float(state.std.mean()))
             arrays = {f"cma.{k}": v for k, v in mjx_cmaes.save_state(state).items()}
-            self._saved = ({"best": self._best}, {**arrays, "elites": elites, "elite_costs": elite_costs})
+            self._saved = ({"best": self._best, "population": population}, {**arrays, "elites": elites, "elite_costs": elite_costs})
             self._save()
         return "The budget of rollouts is spent.", [np.clip(state.mean, 0, 1), *elites]
+
+    def _population(self, dimension: int, left: int) -> int:
+        """Candidates a generation: after a landing, few enough for ``GENERATIONS`` with what is left."""
+        if self._saved is not None:
+            return int(self._saved[0]["population"])
+        if self.options.optimizer == "cmaes":
+            return self.options.population
+        least = min(self.options.population, 4 + int(3 * np.log(dimension)))
+        return int(np.clip(left // GENERATIONS, least, self.options.population))
 
     # Finish -------------------------------------------------------------------------------------------------------
 
