@@ -117,7 +117,7 @@ class LeastSquares:
         self.pixels, self.flow = _of_objects(flow, columns)
         self.spent = 0.0
 
-    def _distances(self, points: np.ndarray, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def distances(self, points: np.ndarray, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Simulated minus observed reach (B, frames, N, directions) and flow (B, frames, N, 2 * points), both in px at
         480 wide, and whether a candidate diverged."""
         batch = self.space.decode(points)
@@ -152,7 +152,7 @@ class LeastSquares:
 
     def residuals(self, points: np.ndarray, frames: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
         """(robust residuals (B, R), their half sum of squares with the prior (B,))."""
-        reach, flow, bad = self._distances(points, frames)
+        reach, flow, bad = self.distances(points, frames)
         robust = self._robust(reach, flow, scale).reshape(len(points), -1)
         prior = (points - self.space.start) / self.space.sigma
         cost = 0.5 * (robust**2).sum(-1) + 0.5 * (prior**2).sum(-1)
@@ -232,7 +232,7 @@ class LeastSquares:
         return best
 
     def _misfit(self, point: np.ndarray, stage: Stage) -> np.ndarray:
-        raw = self._distances(point[None], stage.frames)[0][0]
+        raw = self.distances(point[None], stage.frames)[0][0]
         seen = np.isfinite(raw).sum((0, 2))
         return np.sqrt(np.nansum(raw**2, (0, 2)) / np.maximum(seen, 1)) > MISFIT
 
@@ -242,7 +242,7 @@ class LeastSquares:
         points = self._draws(before, jacobian, generator)
         keep = ~np.isin(owner, np.nonzero(misfit)[0])
         points[:, keep] = now[keep]
-        reach, flow, bad = self._distances(points, stage.frames)
+        reach, flow, bad = self.distances(points, stage.frames)
         prices = 0.5 * (self._robust(reach, flow, stage.scale) ** 2).sum((1, 3)) + np.where(bad, 1e12, 0.0)[:, None]
         combined = now.copy()
         for n in np.nonzero(misfit)[0]:
