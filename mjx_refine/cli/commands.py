@@ -18,6 +18,7 @@ _PATH = click.Path(path_type=Path)
 BACKENDS = ("auto", "mjx", "warp", "mujoco")
 RESULTS = ("refined.yaml", "result.json", "history.csv", "report.html", "overlay.gif", "checkpoint.npz")
 OPTIMIZERS = ("cmaes", "gradient", "hybrid")
+SOLVERS = ("lm", "adam", "gauss-newton", "levenberg-marquardt")
 
 
 @click.group(invoke_without_command=True, no_args_is_help=False, context_settings={"show_default": True})
@@ -30,8 +31,12 @@ OPTIMIZERS = ("cmaes", "gradient", "hybrid")
     "--iterations", type=click.IntRange(1, 10**6), default=100, help="Generations; times population: rollouts."
 )
 @click.option("--optimizer", type=click.Choice(OPTIMIZERS), default="hybrid", help="How to search.")
+@click.option("--solver", type=click.Choice(SOLVERS), default="lm", help="Of each stage of least squares.")
 @click.option("--backend", type=click.Choice(BACKENDS), default="auto", help="Which engine simulates the search.")
 @click.option("--resolution", type=Size(), help="Of the search's pictures; the default is about 160 wide.")
+@click.option(
+    "--refits", type=click.IntRange(0, 1000), default=6, help="Fits around the solution, for intervals; 0: none."
+)
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint in --out.")
 @click.version_option(package_name="mjx-refine", prog_name="refine")
 @click.pass_context

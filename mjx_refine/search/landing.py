@@ -93,6 +93,7 @@ class LeastSquares:
       flow: pixels and observed flow of every mask (``flow_points``), or None to go by outlines alone.
       limit: rollouts that may be spent.
       seed: of the points tried when the horizon grows.
+      solver: what runs inside a stage: ``lm``, ours, or one of ``solvers``.
     """
 
     def __init__(
@@ -105,8 +106,9 @@ class LeastSquares:
         flow: tuple[np.ndarray, np.ndarray] | None = None,
         limit: int = 10**9,
         seed: int = 0,
+        solver: str = "lm",
     ):
-        self.limit, self.seed = limit, seed
+        self.limit, self.seed, self.solver = limit, seed, solver
         self.space, self.rollout, self.image = space, rollout, image
         self.pixel = image[0] / 480.0
         target = np.full((len(seen.support), len(columns), DIRECTIONS), np.nan)
@@ -262,6 +264,9 @@ class LeastSquares:
         return np.clip(point + np.concatenate([near, far]) * self.space.sigma, 0.0, 1.0)
 
     def _stage(self, point: np.ndarray, stage: Stage) -> tuple[np.ndarray, float, np.ndarray]:
+        """One stage from ``point``: (point, cost, Jacobian; without rows where nothing was left for one)."""
+        if self.solver != "lm":
+            return self._others_stage(point, stage)
         sigma, start = self.space.sigma, self.space.start
         damping = 1.0
         base, costs = self.residuals(point[None], stage.frames, stage.scale)
@@ -292,6 +297,23 @@ class LeastSquares:
             if gain < 1e-3 * cost:
                 break
         return point, cost, jacobian
+
+    def _others_stage(self, point: np.ndarray, stage: Stage) -> tuple[np.ndarray, float, np.ndarray]:
+        """One stage by a solver that is not ours."""
+        # jaxopt and optax take a second to import.
+        from mjx_refine.search.solvers import StageProblem, improve
+
+        def residuals(at: np.ndarray) -> tuple[np.ndarray, float]:
+            base, costs = self.residuals(at[None], stage.frames, stage.scale)
+            return base[0], float(costs[0])
+
+        def jacobian(at: np.ndarray, base: np.ndarray) -> np.ndarray:
+            return self.jacobian(at, base, stage.frames, stage.scale)
+
+        flow = 0 if self.flow is None else 2 * POINTS
+        size = self.target.shape[0] * self.target.shape[1] * (DIRECTIONS + flow)
+        problem = StageProblem(residuals, jacobian, self.space.start, self.space.sigma, size)
+        return improve(self.solver, problem, point, stage.iterations, lambda: self._spent)
 
     def _bounded_step(self, point, gradient, curvature, factor) -> np.ndarray:
         """The damped step [prior widths] with coordinates at a bound that push outwards held there."""

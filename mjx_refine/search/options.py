@@ -10,6 +10,8 @@ from mjx_refine.errors import InputError
 
 OPTIMIZERS = ("hybrid", "cmaes", "gradient")
 
+SOLVERS = ("lm", "adam", "gauss-newton", "levenberg-marquardt")
+
 
 @dataclasses.dataclass(frozen=True)
 class Options:
@@ -21,11 +23,14 @@ class Options:
       iterations: generations; population * iterations is the budget of rollouts, whatever the optimiser spends them on.
       optimizer: ``cmaes`` searches from the best sample; ``gradient`` is least squares alone (Levenberg-Marquardt on
         outlines, finite differences); ``hybrid`` lands with least squares and searches from there with the rest.
+      solver: of each stage of least squares: ``lm``, our own Levenberg-Marquardt, which tries several step lengths at
+        once; ``adam`` (optax); ``gauss-newton`` and ``levenberg-marquardt`` (jaxopt).
       backend: ``mujoco`` (C, all cores), ``mjx``, ``warp``, or ``auto`` for the fastest here.
       resolution: (width, height) at which the search compares pictures; None: about 160 wide. Reported scores are
         always at full resolution.
       weights: of the fitness.
       starts: samples from which least squares lands, at most.
+      refits: fits around the solution that tell the parameters' intervals; 0: none.
       threads: of C MuJoCo; None: all cores.
     """
 
@@ -33,19 +38,24 @@ class Options:
     population: int = 128
     iterations: int = 100
     optimizer: str = "hybrid"
+    solver: str = "lm"
     backend: str = "auto"
     resolution: tuple[int, int] | None = None
     weights: Weights = dataclasses.field(default_factory=Weights)
     starts: int = 3
+    refits: int = 6
     threads: int | None = None
 
     def __post_init__(self):
         if self.optimizer not in OPTIMIZERS:
             raise InputError(f"optimizer = {self.optimizer!r}; expected one of {', '.join(OPTIMIZERS)}")
+        if self.solver not in SOLVERS:
+            raise InputError(f"solver = {self.solver!r}; expected one of {', '.join(SOLVERS)}")
         for name, low, high in (
             ("population", 4, 65536),
             ("iterations", 1, 10**6),
             ("starts", 1, 64),
+            ("refits", 0, 1000),
             ("seed", 0, 2**32 - 1),
         ):
             value = getattr(self, name)
