@@ -52,6 +52,17 @@ def _row(kind: str, method: str, chosen: dict[str, dict], targets: dict[str, flo
     return f"| {kind} | {method} | {len(chosen)} | " + " | ".join(cells) + " |"
 
 
+def _truths(runs: list[dict]) -> list[str]:
+    """What the true scenes themselves reach: the oracle's ceiling."""
+    known = {run["clip"]: (run["kind"], run["truth_iou"]) for run in runs if run.get("truth_iou") is not None}
+    if not known:
+        return []
+    kinds = sorted({kind for kind, _ in known.values()})
+    parts = [f"{kind} {np.mean([iou for k, iou in known.values() if k == kind]):.3f}" for kind in kinds]
+    mean = np.mean([iou for _, iou in known.values()])
+    return [f"the true scenes, simulated by C MuJoCo, have an IoU of {mean:.3f}: {', '.join(parts)}"]
+
+
 def tables(runs: list[dict]) -> str:
     """Means by kind of motion, and the share of clips on which ``hybrid`` needs few rollouts."""
     done = _done(runs)
@@ -72,6 +83,7 @@ def tables(runs: list[dict]) -> str:
         if both:
             share = f"{sum(reached)} of {len(both)} clips ({np.mean(reached):.0%})"
             lines.append(f"{method} with at most {FEW:,} rollouts reaches CMA-ES's last IoU on {share}")
+    lines += _truths(runs)
     skipped = sorted({f"{run['method']}: {run['skipped']}" for run in runs if "skipped" in run})
     return "\n".join([*lines, *(f"left out: {text}" for text in skipped)])
 

@@ -34,6 +34,7 @@ from mjx_refine.batch import SceneBatch, batch_from_scenes
 from mjx_refine.files import write_text
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Body, Samples, Scene, load_scene
+from mjx_refine.search.landing import HORIZONS
 from mjx_refine.search.objective import Objective
 from mjx_refine.search.problem import Problem, Start
 from mjx_refine.search.progress import Progress
@@ -44,6 +45,9 @@ METHODS = ("hybrid", "cmaes", "gradient", "pycma", "oracle")
 OURS = ("hybrid", "cmaes", "gradient")
 POSE_NOISE = 0.01
 """Standard deviation of the oracle's poses [m]."""
+
+STEP = 1e-4
+"""The oracle's finite difference in the unit box: its default, 1.5e-8, sees the roughness of contacts, no slope."""
 
 GIVEN = ("size", "camera_position", "camera_pitch", "camera_fovy")
 """Fields of the parameter space that the oracle is told, since poses do not show them."""
@@ -190,7 +194,7 @@ class Poses:
         true = Problem(Samples("<truth>", (truth,), (0,)), observation, options).starts[0]
         pairs = {mask: n for n, mask in enumerate(true.matching) if mask >= 0}
         self.partner = [pairs.get(mask, -1) for mask in start.matching]
-        motion = self._frames(problem, batch_from_scenes([true.given]))
+        motion = self._frames(problem, batch_from_scenes([true.given]), observation.length)
         bodies = list(start.scene.objects)
         self.seen = np.full((observation.length, len(bodies), 4, 3), np.nan)
         self.sizes = np.zeros((len(bodies), 3))
@@ -222,9 +226,9 @@ class Poses:
         return dataclasses.replace(body, size=tuple(float(s) for s in size)), size
 
     @staticmethod
-    def _frames(problem: Problem, batch: SceneBatch) -> Float[np.ndarray, "batch frames bodies 3 4"]:
+    def _frames(problem: Problem, batch: SceneBatch, length: int) -> Float[np.ndarray, "batch frames bodies 3 4"]:
         """Place and axes of every body; far below the floor where a candidate diverges."""
-        poses = problem.reference(batch.shapes).rollout(batch, problem.observation.length)
+        poses = problem.reference(batch.shapes).rollout(batch, length)
         good = np.isfinite(poses).all((1, 2, 3), keepdims=True)
         poses = np.where(good, poses, [0.0, 0.0, -1e2, 1.0, 0.0, 0.0, 0.0])
         return np.concatenate([poses[..., :3, None], rotations.matrix(poses[..., 3:])], -1)
@@ -232,14 +236,17 @@ class Poses:
     def _ends(self, centre: np.ndarray, axes: np.ndarray, i: int) -> np.ndarray:
         return centre[..., None, :] + np.swapaxes(axes * self.sizes[i], -1, -2)
 
-    def residuals(self, points: Float[np.ndarray, "batch dimension"]) -> Float[np.ndarray, "batch residuals"]:
-        """Distances of points on the bodies and of the parameters from the start, both in standard deviations."""
-        frames = self._frames(self.problem, self.space.decode(points))
+    def residuals(
+        self, points: Float[np.ndarray, "batch dimension"], frames: int
+    ) -> Float[np.ndarray, "batch residuals"]:
+        """Distances of points on the bodies in the first ``frames``, and of the parameters from the start, both in
+        standard deviations."""
+        moved = self._frames(self.problem, self.space.decode(points), frames)
         away = []
         for i in range(len(self.partner)):
-            centre, axes = frames[:, :, i, :, 0], frames[:, :, i, :, 1:]
+            centre, axes = moved[:, :, i, :, 0], moved[:, :, i, :, 1:]
             now = np.concatenate([centre[..., None, :], self._ends(centre, axes, i)], -2)
-            away.append(np.nan_to_num((now - self.seen[None, :, i]) / POSE_NOISE).reshape(len(points), -1))
+            away.append(np.nan_to_num((now - self.seen[None, :frames, i]) / POSE_NOISE).reshape(len(points), -1))
         # Every frame says much the same of a smooth motion.
         poses = np.concatenate(away, -1) / np.sqrt(len(self.seen))
         return np.concatenate([poses, (points - self.space.start) / self.space.sigma], -1)
@@ -248,44 +255,53 @@ class Poses:
 def oracle(samples: Samples, observation: Observation, options: Options, truth: Scene) -> Outcome:
     """``mujoco.sysid.optimize`` told the true poses of every frame, sizes and camera: the same-engine problem.
 
-    The poses are C MuJoCo's simulation of the true scene; the clip may come from another engine. sysid's own residual
+    The poses are C MuJoCo's simulation of the true scene. The clip may come from another engine, and its IoU with that
+    simulation, not 1, is then what this can reach; fits of the clip itself may reach more. sysid's own residual
     starts every rollout from measured initial states, which are here the greater part of what is asked for. So its
     routine (``optimize``, with MuJoCo's least squares, bounds and finite differences) is given our residual: places of
-    points on the bodies [cm], beside the prior. It is an oracle for what poses would tell, from one start and with the
-    whole clip at once; nothing that a video could be fitted with.
+    points on the bodies [cm], beside the prior, over a horizon that grows as ours does. It is an oracle for what poses
+    would tell from one start, not a method: no video gives them.
 
     Raises:
       ImportError: without what mujoco.sysid needs (colorama, tabulate).
     """
-    from mujoco.sysid import Parameter, ParameterDict, optimize
-
-    poses = Poses(Problem(samples, observation, options), truth, options)
-    space, problem, start = poses.space, poses.problem, poses.start
-    objective, curve = _objective(problem, start, space), Curve()
-    spent, lowest, best = 0, np.inf, space.start
-
-    def residual(x: np.ndarray, _) -> tuple[list[np.ndarray], list, list]:
-        nonlocal spent, lowest, best
-        points = np.clip(np.atleast_2d(x.T), 0.0, 1.0)
-        if spent + len(points) > options.budget:
-            raise _Spent
-        spent += len(points)
-        values = poses.residuals(points)
-        row = int(np.argmin((values**2).sum(-1)))
-        if (values[row] ** 2).sum() < lowest:
-            lowest, best = float((values[row] ** 2).sum()), points[row]
-            costs, scores = objective(best[None])
-            curve.add(spent, -float(costs[0]), float(scores.iou[0]))
-        return [values.T if x.ndim == 2 else values[0]], [], []
-
-    ends = np.zeros(space.dimension), np.ones(space.dimension)
-    parameters = ParameterDict({"scene": Parameter("scene", space.start, *ends)})
-    reason = "Least squares converged."
     try:
-        optimize(parameters, residual, verbose=False, x_scale=space.sigma, output=io.StringIO())
-    except _Spent:
-        reason = "The budget of rollouts is spent."
-    return Outcome(curve, _best(problem, start, space, [best]), spent, reason)
+        from mujoco.sysid import Parameter, ParameterDict, optimize
+    except ImportError as error:
+        raise ImportError("mujoco.sysid needs the packages colorama and tabulate") from error
+    poses = Poses(Problem(samples, observation, options), truth, options)
+    space, problem, start, length = poses.space, poses.problem, poses.start, observation.length
+    objective, curve = _objective(problem, start, space), Curve()
+    parameters = ParameterDict(
+        {"scene": Parameter("scene", space.start, np.zeros(space.dimension), np.ones(space.dimension))}
+    )
+    spent, reason = 0.0, "Least squares converged."
+    settings = {"x_scale": space.sigma, "eps": STEP, "max_iters": 30, "output": io.StringIO()}
+    for frames in sorted({max(2, round(length * part)) for part in HORIZONS}):
+        lowest, best = np.inf, parameters.as_vector()
+
+        def residual(x: np.ndarray, _, frames=frames) -> tuple[list[np.ndarray], list, list]:
+            nonlocal spent, lowest, best
+            points = np.clip(np.atleast_2d(x.T), 0.0, 1.0)
+            if spent + len(points) * frames / length > options.budget:
+                raise _Spent
+            spent += len(points) * frames / length
+            values = poses.residuals(points, frames)
+            squares = (values**2).sum(-1)
+            row = int(np.argmin(squares))
+            if squares[row] < lowest:
+                lowest, best = float(squares[row]), points[row]
+                costs, scores = objective(best[None])
+                curve.add(int(np.ceil(spent)), -float(costs[0]), float(scores.iou[0]))
+            return [values.T if x.ndim == 2 else values[0]], [], []
+
+        parameters.move_off_bounds()
+        try:
+            parameters, _ = optimize(parameters, residual, verbose=False, **settings)
+        except _Spent:
+            reason = "The budget of rollouts is spent."
+            break
+    return Outcome(curve, _best(problem, start, space, [best]), int(np.ceil(spent)), reason)
 
 
 # Measure --------------------------------------------------------------------------------------------------------------
@@ -302,6 +318,7 @@ def measure(folder: Path, method: Method, base: Options) -> dict:
         "objects": meta.get("objects", len(samples.scenes[0].objects)),
         "method": method.label,
         "budget": options.budget,
+        "truth_iou": meta.get("truth_iou_in_mujoco"),
     }
     run: Callable[..., Outcome] = ours if method.name in OURS else globals()[method.name]
     truth = folder / "truth.yaml"
