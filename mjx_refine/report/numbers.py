@@ -11,7 +11,8 @@ import numpy as np
 from mjx_fitness import UNMATCHED
 
 from mjx_refine.observation import Observation
-from mjx_refine.search.result import RefineResult, Replay
+from mjx_refine.search.intervals import CONFIDENCE
+from mjx_refine.search.result import ParameterRow, RefineResult, Replay
 
 FORMAT = 1
 
@@ -39,7 +40,8 @@ def result_numbers(result: RefineResult, observation: Observation) -> dict[str, 
         "matching": list(result.matching),
         "reason": result.reason,
         "steps": len(result.history),
-        "parameters": [dataclasses.asdict(row) for row in result.parameters],
+        "parameters": [_parameter(row) for row in result.parameters],
+        "identification": _identification(result),
         "undetermined": [row.name for row in result.parameters if not row.determined],
         "fixed": [{"name": name, "reason": reason} for name, reason in result.fixed],
         "problems": [{"index": problem.index, "reason": problem.reason} for problem in result.problems],
@@ -47,6 +49,25 @@ def result_numbers(result: RefineResult, observation: Observation) -> dict[str, 
         "options": dataclasses.asdict(result.options),
     }
     return plain(numbers)
+
+
+def _parameter(row: ParameterRow) -> dict:
+    values = dataclasses.asdict(row)
+    return {"name": values.pop("name"), "value": values.pop("after"), **values}
+
+
+def _identification(result: RefineResult) -> dict | None:
+    """How the intervals were found; None where none were."""
+    known = result.known
+    if known is None:
+        return None
+    return {
+        "confidence": CONFIDENCE,
+        "refits": result.options.refits,
+        "evaluations": known.evaluations,
+        "noise": {"edge": known.edge.tolist(), "flow": known.motion.tolist(), "unit": "px at a picture 480 wide"},
+        "free_directions": [{"spread": d.spread, "weights": dict(d.weights)} for d in known.free],
+    }
 
 
 def result_json(result: RefineResult, observation: Observation) -> str:

@@ -68,6 +68,7 @@ def report_page(result: RefineResult, observation: Observation, animation: bytes
         ],
         groups=tables.parameter_groups(result),
         meanings=tables.meanings(result),
+        free=result.known.free[:5] if result.known is not None else (),
         loose=[row for row in result.parameters if not row.determined],
         options=_options(result),
     )

@@ -30,6 +30,7 @@ class Row:
     unit: str
     before: str
     after: str
+    interval: str
     change: str
     determined: bool
     note: str
@@ -105,6 +106,7 @@ def _row(row: ParameterRow, owner: str) -> Row:
         unit="" if row.unit == _DIMENSIONLESS else row.unit.replace("^2", "²"),
         before=_with_degrees(row.before, row.unit),
         after=_with_degrees(row.after, row.unit),
+        interval="" if row.low is None or row.high is None else f"{number(row.low)} … {number(row.high)}",
         change="" if same else sign + _with_degrees(change, row.unit, digits=3),
         determined=row.determined,
         note=row.note,

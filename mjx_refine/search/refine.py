@@ -14,6 +14,7 @@ from mjx_refine.errors import InputError
 from mjx_refine.files import remove_stale_parts
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Samples, Scene
+from mjx_refine.search.intervals import Intervals
 from mjx_refine.search.options import Options
 from mjx_refine.search.problem import Problem
 from mjx_refine.search.progress import Progress
@@ -86,6 +87,7 @@ def refine(
         moved=found.start.moved,
         matching=found.start.matching,
         parameters=_rows(found),
+        known=found.known,
         fixed=found.space.fixed,
         history=found.history,
         evaluations=found.evaluations,
@@ -131,10 +133,23 @@ def _rows(found: Found) -> tuple[ParameterRow, ...]:
     before, after = Space.around(found.start.scene), found.space
     given = {p.name: p.start for p in before.parameters}
     values = dict(zip(after.names, found.values, strict=True))
-    loose = set(found.undetermined)
-    return tuple(
-        ParameterRow(
-            p.name, p.unit, given[p.name], float(values[p.name]), p.name not in loose, UNDETERMINED * (p.name in loose)
-        )
-        for p in after.parameters
-    )
+    rows = []
+    for j, p in enumerate(after.parameters):
+        value, low, high = float(values[p.name]), None, None
+        note = UNDETERMINED if p.name in found.undetermined else ""
+        if found.known is not None:
+            # The refits' interval, widened where the scene that scores best lies outside of it.
+            low = min(float(p.from_unit(found.known.low[j])), value)
+            high = max(float(p.from_unit(found.known.high[j])), value)
+            note = note or _doubt(found.known, j)
+        rows.append(ParameterRow(p.name, p.unit, given[p.name], value, low, high, not note, note))
+    return tuple(rows)
+
+
+def _doubt(known: Intervals, j: int) -> str:
+    """Why refits do not agree on parameter ``j``, or empty."""
+    if known.on_bound[j]:
+        return "on the edge of what is searched"
+    if not known.determined[j]:
+        return f"the clip narrows its prior to {known.standard_error[j]:.0%} only"
+    return ""

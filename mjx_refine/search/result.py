@@ -10,6 +10,7 @@ from mjx_fitness import Scores
 
 from mjx_refine.scene import Problem as SampleProblem
 from mjx_refine.scene import Scene
+from mjx_refine.search.intervals import Intervals
 from mjx_refine.search.options import Options
 from mjx_refine.search.progress import Step
 
@@ -23,7 +24,8 @@ class ParameterRow:
       unit: of both values.
       before: in the sample that was refined.
       after: in the refined scene.
-      determined: whether the clip's score depends on it.
+      low, high: ends of the 90 % interval; None where none was made.
+      determined: whether the clip, not the start, gives the value.
       note: why not, or empty.
     """
 
@@ -31,6 +33,8 @@ class ParameterRow:
     unit: str
     before: float
     after: float
+    low: float | None
+    high: float | None
     determined: bool
     note: str = ""
 
@@ -59,6 +63,7 @@ class RefineResult:
       moved: how far overlapping objects of that sample were pushed apart at the start [m].
       matching: for each object its mask's id, or -1.
       parameters: before and after.
+      known: intervals, free directions and the noise that was estimated; None if no refits were made.
       fixed: (name, reason) of what no search could tell.
       history: a row a step.
       evaluations: rollouts spent, in units of the whole clip.
@@ -76,6 +81,7 @@ class RefineResult:
     moved: float
     matching: tuple[int, ...]
     parameters: tuple[ParameterRow, ...]
+    known: Intervals | None
     fixed: tuple[tuple[str, str], ...]
     history: tuple[Step, ...]
     evaluations: int

@@ -13,6 +13,7 @@ from mjx_fitness import Scores
 
 from mjx_refine.scene import Scene
 from mjx_refine.search.checkpoint import damaged, digest, load_checkpoint, save_checkpoint
+from mjx_refine.search.intervals import Intervals, intervals
 from mjx_refine.search.landing import LeastSquares, stages
 from mjx_refine.search.objective import Objective
 from mjx_refine.search.problem import Problem, Start
@@ -66,7 +67,8 @@ class Found:
       start, space: what the scene was refined from.
       scene, scores: the best scene and its full-resolution scores by C MuJoCo.
       values: of the space's parameters.
-      undetermined: names of those that the clip does not determine.
+      undetermined: names of those on which the score does not depend.
+      known: intervals of the parameters, None if none were asked for or the best sample was kept as it came.
       history, evaluations, reason: the way there.
       backend, device: what searched.
       searched: seconds of the population search.
@@ -78,6 +80,7 @@ class Found:
     scores: Scores
     values: tuple[float, ...]
     undetermined: tuple[str, ...]
+    known: Intervals | None
     history: tuple[Step, ...]
     evaluations: int
     reason: str
@@ -167,10 +170,11 @@ class Run:
         contact, then from further samples."""
         share = LANDING_SHARE if self.options.optimizer == "hybrid" else 1.0
         limit = int(share * self.options.budget)
-        plan = [(rank, 0) for rank in range(self.options.starts)]
-        plan += [(-1, 2)] + [(rank, 0) for rank in range(self.options.starts, 3 * self.options.starts)] + [(-1, 2)]
+        ranks, count = self.problem.one_of_each_kind_first(), self.options.starts
+        plan = [(rank, 0) for rank in ranks[:count]] + [(-1, 2)]
+        plan += [(rank, 0) for rank in ranks[count : 3 * count]] + [(-1, 2)]
         for step, (rank, hops) in enumerate(plan):
-            if step < self._planned or rank >= len(self.problem.starts):
+            if step < self._planned:
                 continue
             done = max((r.iou for r in self.landed), default=0.0)
             if step >= self.options.starts and done >= LANDED_WELL:
@@ -186,11 +190,7 @@ class Run:
     def _land_one(self, rank: int, limit: int, hops: int) -> Landed:
         start = self.problem.starts[rank]
         space = Space.around(start.scene)
-        reference = self.problem.reference(start.scene.shapes)
-        columns, image = self.problem.columns(start.matching), self.problem.observation.size
-        squares = LeastSquares(
-            space, reference.rollout, self.problem.seen, columns, image, self.problem.flow, limit, self.options.seed
-        )
+        squares = self._squares(start, space, limit)
         objective = self._objective(start, space)
         before = self.evaluations
 
@@ -203,6 +203,21 @@ class Run:
         self.evaluations = before + landing.evaluations
         scores = self.problem.score([space.scene_at(landing.point)], start.matching)
         return Landed(rank, landing.point, landing.covariance, float(scores.fitness[0]), float(scores.iou[0]))
+
+    def _squares(self, start: Start, space: Space, limit: int = 10**9) -> LeastSquares:
+        reference = self.problem.reference(start.scene.shapes)
+        columns, image = self.problem.columns(start.matching), self.problem.observation.size
+        return LeastSquares(
+            space,
+            reference.rollout,
+            self.problem.seen,
+            columns,
+            image,
+            flow=self.problem.flow,
+            limit=limit,
+            seed=self.options.seed,
+            solver=self.options.solver,
+        )
 
     def _beginning(self) -> tuple[Start, Space, np.ndarray, np.ndarray]:
         """Where the population search starts: the best landing, or the best sample."""
@@ -249,7 +264,8 @@ class Run:
                 self._best = (-float(costs[best]), float(scores.iou[best]), float(scores.epe[best]))
             self._step("search", self._best, float(state.std.mean()))
             arrays = {f"cma.{k}": v for k, v in mjx_cmaes.save_state(state).items()}
-            self._saved = ({"best": self._best, "population": population}, {**arrays, "elites": elites, "elite_costs": elite_costs})
+            arrays.update(elites=elites, elite_costs=elite_costs)
+            self._saved = ({"best": self._best, "population": population}, arrays)
             self._save()
         return "The budget of rollouts is spent.", [np.clip(state.mean, 0, 1), *elites]
 
@@ -269,6 +285,12 @@ class Run:
         points = [np.clip(p, 0.0, 1.0) for p in points]
         costs = self._full_costs(space, start, np.array(points))
         point = points[int(np.argmin(costs))]
+        known = None
+        if self.options.refits:
+            self.progress.message(f"{self.options.refits} refits around the solution, for intervals")
+            known = intervals(self._squares(start, space), point, self.options.refits, self.options.seed)
+            candidates = np.stack([point, known.point])
+            point = candidates[int(np.argmin(self._full_costs(space, start, candidates)))]
         loose = insensitive(space, point, lambda p: objective(p)[0])
         point = back_to_start(space, point, loose, lambda p: self._full_costs(space, start, p))
         scene = space.scene_at(point)
@@ -278,7 +300,7 @@ class Run:
             # Nothing better than the best sample as it came.
             space = Space.around(first.scene)
             start, point, scene, scores = first, space.start, first.given, first.scores
-            loose = np.zeros(space.dimension, bool)
+            loose, known = np.zeros(space.dimension, bool), None
         names = tuple(n for n, free in zip(space.names, loose, strict=True) if free)
         values = tuple(float(v) for v in space.values(point))
         return {
@@ -288,6 +310,7 @@ class Run:
             "scores": scores,
             "undetermined": names,
             "values": values,
+            "known": known,
         }
 
     def _full_costs(self, space: Space, start: Start, points: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from mjx_refine.errors import InputError
 from mjx_refine.files import remove_stale_parts, write_atomic, write_text
 
 BROKEN = (ValueError, OSError, EOFError, zipfile.BadZipFile)
-TINY = ["--population", "8", "--iterations", "6", "--seed", "3"]
+TINY = ["--population", "8", "--iterations", "6", "--seed", "3", "--refits", "2"]
 
 
 @pytest.fixture(scope="module")

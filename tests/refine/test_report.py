@@ -23,6 +23,7 @@ from mjx_refine.report.numbers import plain
 from mjx_refine.report.page import report_page
 from mjx_refine.report.tables import number, parameter_groups
 from mjx_refine.scene import Body, Camera, Problem, Scene, load_scene
+from mjx_refine.search.intervals import FreeDirection, Intervals
 from mjx_refine.search.options import Options
 from mjx_refine.search.progress import Step
 from mjx_refine.search.result import ParameterRow, RefineResult, Replay
@@ -63,9 +64,9 @@ def replay(name: str, shift: int, iou: float) -> Replay:
 
 def made_up(name: str = HOSTILE, iou: float = 0.9) -> RefineResult:
     rows = (
-        ParameterRow(f"{name}.size.x", "m", 0.2, 0.25, True),
-        ParameterRow("ball.damping", "1/s", 4.0, 4.0, False, "one prior width changes nothing"),
-        ParameterRow("camera.pitch", "rad", 0.5, 0.75, True),
+        ParameterRow(f"{name}.size.x", "m", 0.2, 0.25, 0.24, 0.27, True),
+        ParameterRow("ball.damping", "1/s", 4.0, 4.0, 1.5, 9.0, False, "one prior width changes nothing"),
+        ParameterRow("camera.pitch", "rad", 0.5, 0.75, None, None, True),
     )
     steps = tuple(
         Step(phase, i, 10 * (i + 1), 100, 0.5 * i, fitness, 0.5, 0.3, 0.1)
@@ -80,6 +81,20 @@ def made_up(name: str = HOSTILE, iou: float = 0.9) -> RefineResult:
         moved=0.012,
         matching=(1, -1),
         parameters=rows,
+        known=Intervals(
+            point=np.full(3, 0.5),
+            cost=1.0,
+            standard_error=np.full(3, 0.1),
+            covariance=0.01 * np.eye(3),
+            low=np.full(3, 0.4),
+            high=np.full(3, 0.6),
+            determined=np.array([True, False, True]),
+            on_bound=np.zeros(3, bool),
+            free=(FreeDirection(0.8, ((f"{name}.size.x", 0.71), ("camera.pitch", -0.7))),),
+            edge=np.array([0.3, 0.4]),
+            motion=np.array([0.2, 0.5]),
+            evaluations=123,
+        ),
         fixed=((f"{name}.mass", "only ratios of masses act"),),
         history=steps,
         evaluations=30,

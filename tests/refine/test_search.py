@@ -25,7 +25,7 @@ SIZE, FRAMES = (96, 64), 8
 BALL = Body("sphere", "ball", (0.25,), (-0.6, 0.3, 0.8), linear_velocity=(2.5, 0.0, 1.0))
 CRATE = Body("box", "crate", (0.3, 0.2, 0.2), (0.7, 0.2, 0.2), linear_velocity=(-2.0, 0.5, 0.0))
 TRUTH = Scene((BALL, CRATE), Camera((0.0, -3.0, 1.8), 62.0, 45.0))
-TINY = Options(population=8, iterations=4, backend="mujoco", threads=1)
+TINY = Options(population=8, iterations=4, backend="mujoco", threads=1, refits=0)
 
 
 def clip_of(scene: Scene, **changes) -> Observation:

@@ -1,0 +1,229 @@
+"""What a clip determines: refits from several starts around the solution, and intervals from their curvature and spread.
+
+After contacts the sum of squares is jagged: its curvature at one optimum says how sharp that notch is, not how well the
+clip determines a parameter. So the solution is fitted again from several starts around it. The covariance is the mean of
+the curvatures' inverses (within) and the scatter of the refits about the best (between), as for estimates from several
+imputations (Rubin, Multiple Imputation for Nonresponse in Surveys, 1987, eq. 3.1.5).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import stats
+
+from mjx_refine.search.landing import LeastSquares
+from mjx_refine.space import Space
+
+CONFIDENCE = 0.90
+
+REFITS = 6
+
+INFLATION = 1.0
+"""Factor on the standard errors, calibrated on generated clips (``benchmarks.parameters``) that no table reports."""
+
+DETERMINED = 0.3
+"""Standard error, in prior widths, below which the clip is said to determine a parameter."""
+
+EDGE_FLOOR = 0.15
+"""Least standard deviation of an outline's distance [px at a picture 480 wide]: masks are drawn on a grid."""
+
+MOTION_FLOOR = 0.2
+"""The same of flow: more than a simulation without noise would need, but contacts are not right to less."""
+
+HUBER = 2.5
+"""Residuals beyond this many standard deviations count less (Cauchy's loss)."""
+
+STEP = 0.05
+"""Finite-difference step of the first Jacobian, and largest of the later ones [prior widths]."""
+
+LEAST_STEP = 0.003
+ITERATIONS = 8
+TRIALS = np.array([1e-4, 1e-2, 1.0, 1e2, 1e4])
+
+ON_BOUND = 1e-3
+"""Distance to a bound in the unit box within which a parameter is said to lie on it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FreeDirection:
+    """Parameters that the clip leaves free to change together.
+
+    Attributes:
+      spread: standard deviation along it [prior widths].
+      weights: share of each parameter that takes part, in prior widths, largest first.
+    """
+
+    spread: float
+    weights: tuple[tuple[str, float], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Intervals:
+    """Marginal 90 % intervals of all parameters around a point.
+
+    Attributes:
+      point: the best refit, unit box.
+      cost: its half sum of squares.
+      standard_error: [prior widths].
+      covariance: [prior widths squared].
+      low, high: ends of the intervals, unit box.
+      determined: whether the clip, not the prior, gives the value.
+      on_bound: whether the point lies on the edge of the box.
+      free: directions that the clip leaves free, widest first.
+      edge, motion: estimated standard deviations of outlines and flow, by object [px at a picture 480 wide].
+      evaluations: rollouts that it took.
+    """
+
+    point: Float[np.ndarray, "dimension"]
+    cost: float
+    standard_error: Float[np.ndarray, "dimension"]
+    covariance: Float[np.ndarray, "dimension dimension"]
+    low: Float[np.ndarray, "dimension"]
+    high: Float[np.ndarray, "dimension"]
+    determined: Bool[np.ndarray, "dimension"]
+    on_bound: Bool[np.ndarray, "dimension"]
+    free: tuple[FreeDirection, ...]
+    edge: Float[np.ndarray, "objects"]
+    motion: Float[np.ndarray, "objects"]
+    evaluations: int
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fit:
+    point: np.ndarray
+    cost: float
+    covariance: np.ndarray
+
+
+class _Posterior:
+    """Minus the log posterior of points at a measured noise, and Levenberg-Marquardt on it."""
+
+    def __init__(self, squares: LeastSquares):
+        self.squares, self.space = squares, squares.space
+        self.frames = len(squares.target)
+        objects = squares.target.shape[1]
+        self.edge, self.motion = np.ones(objects), np.full(objects, 0.5)
+
+    def measure_noise(self, point: np.ndarray) -> None:
+        """Robust standard deviations of the residuals at ``point``, by object."""
+        reach, flow, _ = self.squares.distances(point[None], self.frames)
+        objects = range(len(self.edge))
+        self.edge = np.array([_deviation(reach[0][:, n], EDGE_FLOOR) for n in objects])
+        self.motion = np.array([_deviation(flow[0][:, n], MOTION_FLOOR) for n in objects])
+
+    def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(robust residuals (B, R), costs (B,))."""
+        reach, flow, bad = self.squares.distances(points, self.frames)
+        raw = np.concatenate(
+            [np.nan_to_num(reach) / self.edge[:, None], np.nan_to_num(flow) / self.motion[:, None]], -1
+        ).reshape(len(points), -1)
+        robust = np.sign(raw) * HUBER * np.sqrt(np.log1p((raw / HUBER) ** 2))
+        prior = (points - self.space.start) / self.space.sigma
+        cost = 0.5 * (robust**2).sum(-1) + 0.5 * (prior**2).sum(-1)
+        return robust, np.where(bad, np.inf, cost)
+
+    def fit(self, point: np.ndarray) -> _Fit:
+        """Levenberg-Marquardt with difference steps that follow the standard errors down."""
+        sigma, size = self.space.sigma, len(point)
+        steps, damping, idle = np.full(size, STEP), 1e-2, 0
+        base, costs = self(point[None])
+        base, cost, covariance = base[0], float(costs[0]), np.eye(size)
+        for iteration in range(ITERATIONS):
+            jacobian = self._jacobian(point, base, steps, iteration)
+            gradient = jacobian.T @ base + (point - self.space.start) / sigma
+            curvature = jacobian.T @ jacobian + np.eye(size)
+            covariance = np.linalg.inv(curvature)
+            steps = np.clip(np.sqrt(np.diag(covariance)), LEAST_STEP, STEP)
+            trials = []
+            for factor in damping * TRIALS:
+                step = -np.linalg.solve(curvature + factor * np.diag(np.diag(curvature)), gradient)
+                step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-12))
+                trials.append(np.clip(point + step * sigma, 0.0, 1.0))
+            moved, costs = self(np.array(trials))
+            best = int(np.argmin(costs))
+            gain = cost - float(costs[best])
+            if gain > 0:
+                point, base, cost = trials[best], moved[best], float(costs[best])
+                damping = float(np.clip(damping * TRIALS[best], 1e-8, 1e3))
+            else:
+                damping = min(damping * 1e3, 1e3)
+            idle = idle + 1 if gain < 0.1 else 0
+            if idle == 2:
+                break
+        return _Fit(point, cost, covariance)
+
+    def _jacobian(self, point: np.ndarray, base: np.ndarray, steps: np.ndarray, turn: int) -> np.ndarray:
+        """d residuals / d prior widths by one-sided differences, the side alternating from turn to turn, (R, D)."""
+        sigma = self.space.sigma
+        sign = np.where((np.arange(len(point)) + turn) % 2 == 0, 1.0, -1.0)
+        beyond = point + sign * steps * sigma
+        sign = np.where((beyond > 1.0) | (beyond < 0.0), -sign, sign)
+        moved, _ = self(np.clip(point + np.diag(sign * steps * sigma), 0.0, 1.0))
+        return ((moved - base) / (sign * steps)[:, None]).T
+
+
+def _deviation(values: np.ndarray, floor: float) -> float:
+    seen = values[np.isfinite(values)]
+    return max(1.4826 * float(np.median(np.abs(seen))), floor) if len(seen) else 1.0
+
+
+def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refits: int, seed: int) -> Intervals:
+    """Refits around ``point`` and what their curvatures and scatter say about each parameter.
+
+    Args:
+      squares: the residuals.
+      point: the solution, unit box.
+      refits: how many, at least 2.
+      seed: of their starts.
+    """
+    before = squares.evaluations
+    posterior = _Posterior(squares)
+    space, sigma = squares.space, squares.space.sigma
+    posterior.measure_noise(point)
+    first = posterior.fit(point)
+    posterior.measure_noise(first.point)
+    generator = np.random.default_rng([seed, 17])
+    factor = np.linalg.cholesky(first.covariance)
+    fits = [posterior.fit(first.point)]
+    for _ in range(refits):
+        away = 3.0 * factor @ generator.standard_normal(len(point)) + 0.03 * generator.standard_normal(len(point))
+        fits.append(posterior.fit(np.clip(first.point + away * sigma, 0.0, 1.0)))
+    best = min(fits, key=lambda fit: fit.cost)
+    within = np.mean([fit.covariance for fit in fits], 0)
+    apart = np.array([(fit.point - best.point) / sigma for fit in fits if fit is not best])
+    between = apart.T @ apart / len(apart)
+    covariance = INFLATION**2 * (within + between)
+    error = np.minimum(np.sqrt(np.diag(covariance)), 1.0)
+    reach = stats.t.ppf(0.5 + CONFIDENCE / 2, refits) * error * sigma
+    edge = (best.point < ON_BOUND) | (best.point > 1 - ON_BOUND)
+    return Intervals(
+        point=best.point,
+        cost=best.cost,
+        standard_error=error,
+        covariance=covariance,
+        low=np.clip(best.point - reach, 0.0, 1.0),
+        high=np.clip(best.point + reach, 0.0, 1.0),
+        determined=(error < DETERMINED) & ~edge,
+        on_bound=edge,
+        free=_free(space, covariance),
+        edge=posterior.edge,
+        motion=posterior.motion,
+        evaluations=squares.evaluations - before,
+    )
+
+
+def _free(space: Space, covariance: np.ndarray) -> tuple[FreeDirection, ...]:
+    """Principal directions wider than ``DETERMINED`` in which several parameters take part."""
+    variances, directions = np.linalg.eigh(covariance)
+    result = []
+    for j in np.argsort(variances)[::-1]:
+        spread = float(np.sqrt(variances[j]))
+        weights = directions[:, j] * np.sign(directions[np.argmax(np.abs(directions[:, j])), j])
+        order = [int(k) for k in np.argsort(-np.abs(weights)) if abs(weights[k]) > 0.25]
+        if spread > DETERMINED and len(order) > 1:
+            names = tuple((space.names[k], round(float(weights[k]), 2)) for k in order)
+            result.append(FreeDirection(round(spread, 3), names))
+    return tuple(result)

@@ -1,0 +1,120 @@
+"""Intervals of parameters: they hold the truth on clips of our own, and say what a clip cannot tell."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mjx_refine import Options, refine
+from mjx_refine.batch import batch_from_scenes
+from mjx_refine.observation import Observation
+from mjx_refine.scene import Body, Camera, Scene
+from mjx_refine.search.features import flow_points, outlines
+from mjx_refine.search.intervals import intervals
+from mjx_refine.search.landing import LeastSquares
+from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.space import Space
+from mjx_refine.view.picture import draw
+
+SIZE, FRAMES = (320, 214), 16
+CAMERA = Camera((0.0, -3.0, 1.6), 65.0, 45.0)
+FLIGHT = Scene(
+    (Body("sphere", "ball", (0.2,), (-0.8, 0.3, 0.9), linear_velocity=(2.0, 0.4, 2.2)),), CAMERA, (0.0, 0.0, -9.81)
+)
+
+
+class Clip:
+    """A clip of ``FLIGHT`` with noise, and least squares on it from a start beside the truth."""
+
+    def __init__(self, seed: int, noise: float = 0.5):
+        generator = np.random.default_rng(seed)
+        simulator = MujocoSimulator(FLIGHT.shapes, 30.0, 1)
+        batch = batch_from_scenes([FLIGHT])
+        self.masks, flow = draw(simulator.rollout(batch, FRAMES)[0], batch, SIZE)
+        self.flow = flow + noise * generator.standard_normal(flow.shape)
+        around = Space.around(FLIGHT)
+        self.start = around.scene_at(
+            np.clip(around.start + 0.7 * around.sigma * generator.standard_normal(around.dimension), 0, 1)
+        )
+        self.space = Space.around(self.start)
+        seen = outlines(self.masks)
+        points = flow_points(self.masks, self.flow, seen.ids)
+        self.squares = LeastSquares(self.space, simulator.rollout, seen, (0,), SIZE, points)
+
+    def truth(self) -> np.ndarray:
+        true = {p.name: p.start for p in Space.around(FLIGHT).parameters}
+        return np.array([p.to_unit(true[p.name]) for p in self.space.parameters])
+
+
+@pytest.fixture(scope="module")
+def known():
+    """Intervals on six noisy clips, from points near the truth."""
+    result = []
+    for seed in range(6):
+        clip = Clip(seed)
+        near = clip.truth() + 0.05 * clip.space.sigma * np.random.default_rng(seed + 50).standard_normal(
+            clip.space.dimension
+        )
+        result.append((clip, intervals(clip.squares, np.clip(near, 0, 1), 4, seed)))
+    return result
+
+
+def test_intervals_hold_the_truth(known):
+    inside = [(told.low <= clip.truth()) & (clip.truth() <= told.high) for clip, told in known]
+    determined = np.array([told.determined for _, told in known])
+    assert np.array(inside)[determined].mean() > 0.8
+    assert determined.sum() > 6 * 3
+
+
+def test_what_a_flight_does_not_show_is_not_determined(known):
+    for clip, told in known:
+        row = dict(zip(clip.space.names, range(clip.space.dimension), strict=True))
+        for name in ("ball.friction.sliding", "ball.friction.rolling", "ball.damping"):
+            assert not told.determined[row[name]]
+            assert told.standard_error[row[name]] > 0.9
+        for name in ("ball.velocity.x", "ball.velocity.z"):
+            assert told.determined[row[name]]
+
+
+def test_more_noise_gives_wider_intervals():
+    errors = []
+    for noise in (0.3, 3.0):
+        clip = Clip(3, noise)
+        told = intervals(clip.squares, clip.truth(), 3, 0)
+        assert told.motion[0] == pytest.approx(noise * 480 / SIZE[0], rel=0.25)
+        spin = [name.startswith("ball.spin") for name in clip.space.names]
+        errors.append(told.standard_error[spin])
+    assert (errors[1] > 3 * errors[0]).all()
+
+
+def test_the_same_seed_gives_the_same_intervals():
+    one, two = (intervals(clip.squares, clip.truth(), 2, 5) for clip in (Clip(1), Clip(1)))
+    np.testing.assert_array_equal(one.low, two.low)
+    np.testing.assert_array_equal(one.covariance, two.covariance)
+    assert one.free == two.free
+
+
+def test_an_unseen_object_determines_nothing():
+    clip = Clip(2)
+    clip.squares.target[:] = np.nan
+    clip.squares.flow[:] = np.nan
+    told = intervals(clip.squares, clip.space.start, 2, 0)
+    assert not told.determined.any()
+    np.testing.assert_allclose(told.standard_error, 1.0, rtol=0.05)
+
+
+def test_results_carry_intervals_around_their_values():
+    clip = Clip(4)
+    observation = Observation(clip.flow.astype(np.float32), clip.masks, 30.0)
+    options = Options(population=8, iterations=60, threads=1, refits=3, starts=1)
+    result = refine(clip.start, observation, options)
+    assert result.known is not None
+    for row in result.parameters:
+        assert row.low <= row.after <= row.high
+        assert row.determined == (row.note == "")
+    without = refine(clip.start, observation, dataclasses.replace(options, refits=0))
+    assert without.known is None
+    assert all(row.low is None for row in without.parameters)
+    assert result.refined.scores.fitness[0] >= without.refined.scores.fitness[0] - 1e-9
