@@ -1,9 +1,14 @@
-"""What a clip determines: refits from several starts around the solution, and intervals from their curvature and spread.
+"""What a clip determines: the posterior's spread around the solution, and refits from several starts within it.
 
-After contacts the sum of squares is jagged: its curvature at one optimum says how sharp that notch is, not how well the
-clip determines a parameter. So the solution is fitted again from several starts around it. The covariance is the mean of
-the curvatures' inverses (within) and the scatter of the refits about the best (between), as for estimates from several
-imputations (Rubin, Multiple Imputation for Nonresponse in Surveys, 1987, eq. 3.1.5).
+After contacts the sum of squares is jagged, and a scene's overall scale, say, changes no picture: derivatives at a point
+say how sharp a notch is, and differences of single parameters do not cancel well enough to show that a direction is
+flat. So residuals are differenced along the principal axes of the spread itself, one standard deviation to each side,
+until the spread agrees with what it measures (statistical linearisation: Lefebvre et al., Kalman filters for
+non-linear systems, Int. J. Control 77, 2004; iterated as in Garcia-Fernandez et al., Posterior linearization filter,
+IEEE Trans. Signal Processing 63, 2015). What is no straight line over that distance counts as noise. The solution is
+then fitted again from several starts. The covariance is the mean of the fits' (within) and their scatter about the best
+(between), as for estimates from several imputations (Rubin, Multiple Imputation for Nonresponse in Surveys, 1987,
+eq. 3.1.5).
 """
 
 from __future__ import annotations
@@ -19,9 +24,7 @@ from mjx_refine.space import Space
 
 CONFIDENCE = 0.90
 
-REFITS = 6
-
-INFLATION = 1.0
+INFLATION = 1.4
 """Factor on the standard errors, calibrated on generated clips (``benchmarks.parameters``) that no table reports."""
 
 DETERMINED = 0.3
@@ -41,6 +44,19 @@ STEP = 0.05
 
 LEAST_STEP = 0.003
 ITERATIONS = 8
+LEAST_AXIS = 0.003
+SETTLE, REFIT = 8, 3
+"""Iterations of the first spread, and of each refit's."""
+
+AWAY = 3.0
+"""Standard deviations by which a refit's start is away from the last refit's end; along what the clip leaves open at
+most a prior width."""
+
+SCALE = 0.12
+"""Standard deviation of the logarithm of a sample's overall scale: its lengths, speeds and gravity are wrong together,
+and no clip tells."""
+
+RIDGES = (0.0, 0.1, 1.0, 10.0, 100.0)
 TRIALS = np.array([1e-4, 1e-2, 1.0, 1e2, 1e4])
 
 ON_BOUND = 1e-3
@@ -125,13 +141,13 @@ class _Posterior:
         cost = 0.5 * (robust**2).sum(-1) + 0.5 * (prior**2).sum(-1)
         return robust, np.where(bad, np.inf, cost)
 
-    def fit(self, point: np.ndarray) -> _Fit:
+    def fit(self, point: np.ndarray, iterations: int = ITERATIONS) -> _Fit:
         """Levenberg-Marquardt with difference steps that follow the standard errors down."""
         sigma, size = self.space.sigma, len(point)
         steps, damping, idle = np.full(size, STEP), 1e-2, 0
         base, costs = self(point[None])
         base, cost, covariance = base[0], float(costs[0]), np.eye(size)
-        for iteration in range(ITERATIONS):
+        for iteration in range(iterations):
             jacobian = self._jacobian(point, base, steps, iteration)
             gradient = jacobian.T @ base + (point - self.space.start) / sigma
             curvature = jacobian.T @ jacobian + np.eye(size)
@@ -155,6 +171,42 @@ class _Posterior:
                 break
         return _Fit(point, cost, covariance)
 
+    def spread(self, point: np.ndarray, factor: np.ndarray, iterations: int) -> _Fit:
+        """Refines point and spread together; ``factor`` has the spread's principal axes as columns [prior widths]."""
+        base, costs = self(point[None])
+        base, cost = base[0], float(costs[0])
+        for _ in range(iterations):
+            slopes, weights, bent = self._along(point, base, factor)
+            curvature = slopes.T @ (weights[:, None] * slopes)
+            # Slopes of a jagged function are noisy, and squares of noise add up: that much is taken off again. Noise
+            # of variance v in each residual gives slopes v / 2 and bends 3 v / 2.
+            diagonal = np.maximum(np.diag(curvature), 1e-12)
+            kept = np.sqrt(np.maximum(1 - (weights[:, None] * bent**2).sum(0) / (3 * diagonal), 0.1))
+            curvature = curvature * np.outer(kept, kept) + factor.T @ factor
+            gradient = slopes.T @ (weights * base) + factor.T @ ((point - self.space.start) / self.space.sigma)
+            steps = [-factor @ np.linalg.solve(curvature + f * np.eye(len(point)), gradient) for f in RIDGES]
+            steps = [step * min(1.0, 1.0 / max(np.abs(step).max(), 1e-12)) for step in steps]
+            trials = np.clip(point + np.array(steps) * self.space.sigma, 0.0, 1.0)
+            moved, costs = self(trials)
+            best = int(np.argmin(costs))
+            if costs[best] < cost:
+                point, base, cost = trials[best], moved[best], float(costs[best])
+            widths, axes = np.linalg.eigh(curvature)
+            factor = factor @ axes / np.sqrt(np.clip(widths, 1 / 9, 9.0))
+        return _Fit(point, cost, factor @ factor.T)
+
+    def _along(self, point: np.ndarray, base: np.ndarray, factor: np.ndarray):
+        """Slopes (R, D) along the columns of ``factor``, weights (R,) of the residuals, and their bends (R, D)."""
+        sigma, size = self.space.sigma, len(point)
+        ahead = np.clip(point + factor.T * sigma, 0.0, 1.0)
+        behind = np.clip(point - factor.T * sigma, 0.0, 1.0)
+        residuals, _ = self(np.concatenate([ahead, behind]))
+        # At a bound of the box less than the whole distance is gone.
+        gone = np.linalg.norm((ahead - behind) / sigma, axis=1) / np.maximum(2 * np.linalg.norm(factor, axis=0), 1e-12)
+        slopes = ((residuals[:size] - residuals[size:]) / 2 / np.maximum(gone, 0.2)[:, None]).T
+        bent = ((residuals[:size] + residuals[size:]) / 2 - base).T
+        return slopes, 1 / (1 + (bent**2).sum(1)), bent
+
     def _jacobian(self, point: np.ndarray, base: np.ndarray, steps: np.ndarray, turn: int) -> np.ndarray:
         """d residuals / d prior widths by one-sided differences, the side alternating from turn to turn, (R, D)."""
         sigma = self.space.sigma
@@ -163,6 +215,17 @@ class _Posterior:
         sign = np.where((beyond > 1.0) | (beyond < 0.0), -sign, sign)
         moved, _ = self(np.clip(point + np.diag(sign * steps * sigma), 0.0, 1.0))
         return ((moved - base) / (sign * steps)[:, None]).T
+
+
+def _axes(covariance: np.ndarray) -> np.ndarray:
+    """Principal axes as columns, a standard deviation long but no shorter than ``LEAST_AXIS``."""
+    variances, directions = np.linalg.eigh(covariance)
+    return directions * np.maximum(np.sqrt(np.maximum(variances, 0.0)), LEAST_AXIS)
+
+
+def _no_wider_than_prior(covariance: np.ndarray) -> np.ndarray:
+    variances, directions = np.linalg.eigh(covariance)
+    return (directions * np.clip(variances, 0.0, 1.0)) @ directions.T
 
 
 def _deviation(values: np.ndarray, floor: float) -> float:
@@ -182,20 +245,28 @@ def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refi
     before = squares.evaluations
     posterior = _Posterior(squares)
     space, sigma = squares.space, squares.space.sigma
+    for _ in range(2):
+        posterior.measure_noise(point)
+        point = posterior.fit(point).point
     posterior.measure_noise(point)
     first = posterior.fit(point)
+    first = posterior.spread(first.point, _axes(first.covariance), SETTLE)
     posterior.measure_noise(first.point)
     generator = np.random.default_rng([seed, 17])
-    factor = np.linalg.cholesky(first.covariance)
-    fits = [posterior.fit(first.point)]
+    fits = [first]
     for _ in range(refits):
-        away = 3.0 * factor @ generator.standard_normal(len(point)) + 0.03 * generator.standard_normal(len(point))
-        fits.append(posterior.fit(np.clip(first.point + away * sigma, 0.0, 1.0)))
+        # Each starts from where the last one ended: valleys are curved, and a chain follows them.
+        axes = _axes(fits[-1].covariance)
+        reach = np.clip(1.0 / np.linalg.norm(axes, axis=0), 1.0, AWAY)
+        away = (axes * reach) @ generator.standard_normal(len(point))
+        back = posterior.fit(np.clip(fits[-1].point + away * sigma, 0.0, 1.0), 3)
+        fits.append(posterior.spread(back.point, 1.3 * axes, REFIT))
     best = min(fits, key=lambda fit: fit.cost)
     within = np.mean([fit.covariance for fit in fits], 0)
     apart = np.array([(fit.point - best.point) / sigma for fit in fits if fit is not best])
-    between = apart.T @ apart / len(apart)
-    covariance = INFLATION**2 * (within + between)
+    between = apart.T @ apart / max(len(apart), 1)
+    gauge = _scale_direction(space, best.point)
+    covariance = _no_wider_than_prior(INFLATION**2 * (within + between)) + SCALE**2 * np.outer(gauge, gauge)
     error = np.minimum(np.sqrt(np.diag(covariance)), 1.0)
     reach = stats.t.ppf(0.5 + CONFIDENCE / 2, refits) * error * sigma
     edge = (best.point < ON_BOUND) | (best.point > 1 - ON_BOUND)
@@ -213,6 +284,26 @@ def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refi
         motion=posterior.motion,
         evaluations=squares.evaluations - before,
     )
+
+
+def _scale_direction(space: Space, point: np.ndarray) -> np.ndarray:
+    """Change of every parameter [prior widths] where all lengths grow by one e-fold, seen from the camera's foot."""
+    values = space.values(point)
+    camera = dict(zip(space.names, values, strict=True)).get("camera.height")
+    result = np.zeros(space.dimension)
+    if camera is None:
+        return result
+    for j, (parameter, value) in enumerate(zip(space.parameters, values, strict=True)):
+        if parameter.field == "position":
+            change = value - space.scene.camera.position[parameter.index[1]]
+        elif (
+            parameter.field in ("clearance", "linear_velocity") or parameter.unit == "m" or parameter.field == "gravity"
+        ):
+            change = value
+        else:
+            continue
+        result[j] = (change if parameter.offset is None else change / (value + parameter.offset)) / parameter.width
+    return result
 
 
 def _free(space: Space, covariance: np.ndarray) -> tuple[FreeDirection, ...]:

@@ -74,8 +74,12 @@ def test_what_a_flight_does_not_show_is_not_determined(known):
         for name in ("ball.friction.sliding", "ball.friction.rolling", "ball.damping"):
             assert not told.determined[row[name]]
             assert told.standard_error[row[name]] > 0.9
-        for name in ("ball.velocity.x", "ball.velocity.z"):
+        for name in ("ball.spin.x", "ball.spin.y", "ball.spin.z", "ball.velocity.y"):
             assert told.determined[row[name]]
+        widest = dict(told.free[0].weights)
+        assert {"camera.height", "ball.radius", "gravity"} <= set(widest)  # the overall scale
+        assert len({np.sign(widest[name]) for name in ("camera.height", "ball.radius", "gravity")}) == 1
+        assert (told.standard_error <= 1.0).all()
 
 
 def test_more_noise_gives_wider_intervals():
