@@ -18,6 +18,7 @@ _PATH = click.Path(path_type=Path)
 BACKENDS = ("auto", "mjx", "warp", "mujoco")
 RESULTS = ("refined.yaml", "result.json", "history.csv", "report.html", "overlay.gif", "checkpoint.npz")
 OPTIMIZERS = ("cmaes", "gradient", "hybrid")
+DERIVATIVES = ("auto", "differences", "autodiff")
 SOLVERS = ("lm", "adam", "gauss-newton", "levenberg-marquardt")
 
 
@@ -32,6 +33,7 @@ SOLVERS = ("lm", "adam", "gauss-newton", "levenberg-marquardt")
 )
 @click.option("--optimizer", type=click.Choice(OPTIMIZERS), default="hybrid", help="How to search.")
 @click.option("--solver", type=click.Choice(SOLVERS), default="lm", help="Of each stage of least squares.")
+@click.option("--derivatives", type=click.Choice(DERIVATIVES), default="auto", help="Of least squares.")
 @click.option("--backend", type=click.Choice(BACKENDS), default="auto", help="Which engine simulates the search.")
 @click.option("--resolution", type=Size(), help="Of the search's pictures; the default is about 160 wide.")
 @click.option(

@@ -103,17 +103,19 @@ class Differentiator:
       simulator: of the same scene kind.
       chunk: how many tangents share a rollout; fewer need less memory (the rest of the last chunk
         is filled up).
+      frames: rollouts are computed for at least so many: one program then serves every shorter horizon.
 
     Raises:
       ValueError: the simulator is for another scene kind.
     """
 
-    def __init__(self, space: Space, simulator: MjxSimulator, chunk: int = CHUNK):
+    def __init__(self, space: Space, simulator: MjxSimulator, chunk: int = CHUNK, frames: int = 1):
         if space.scene.shapes != simulator.shapes:
             raise ValueError(f"scene kind {space.scene.shapes}; this simulator was made for {simulator.shapes}")
         self.space = space
         self.simulator = simulator
         self.chunk = chunk
+        self.frames = frames
         self._programs = _PROGRAMS.setdefault(simulator, {})
         self._last: tuple[tuple, tuple[Inputs, Inputs, np.ndarray, np.ndarray]] | None = None
 
@@ -139,7 +141,7 @@ class Differentiator:
         Raises:
           DerivativeError: the rollout or a derivative is not finite.
         """
-        return self.jacobian(point, frames, outline_view(self.simulator.shapes, image, directions))
+        return self._frame_by_frame(point, frames, outline_view(self.simulator.shapes, image, directions))
 
     def flow(
         self,
@@ -154,7 +156,7 @@ class Differentiator:
           DerivativeError: the rollout or a derivative is not finite.
         """
         view = flow_view(self.simulator.shapes, image)
-        return self.jacobian(point, frames, view, np.asarray(pixels[:frames], np.float64))
+        return self._frame_by_frame(point, frames, view, np.asarray(pixels[:frames], np.float64))
 
     def jacobian(self, point: Float[np.ndarray, "dimension"], frames: int, function: View, *data: Array | np.ndarray):
         """Value of ``function`` and its derivatives (leading axis ``dimension``), by forward mode.
@@ -170,11 +172,22 @@ class Differentiator:
           ValueError: the point lies outside of the box.
         """
         inputs, moves, poses, slopes = self._rollout(point, frames)
-        poses, slopes = poses[:frames], slopes[:, :frames]
-        require_finite(poses, slopes, self.space.names)
         if function is poses_view:
             return poses, slopes
-        arrays = ((poses, *_rest(inputs)), (slopes, *_rest(moves)), data)
+        return self._look(inputs, moves, poses, slopes, function, data)
+
+    def _frame_by_frame(self, point: np.ndarray, frames: int, function: View, *data: np.ndarray):
+        """``jacobian`` of a view, and of data, that have a row for each frame: all horizons share a program."""
+        inputs, moves, poses, slopes = self._rollout(point, frames)
+        beyond = max(horizon(self.frames) - frames, 0) if self.frames > 1 else 0
+        # The last frame again: whatever the rollout does beyond the horizon has no say.
+        poses, *rows = (np.concatenate([a, np.repeat(a[-1:], beyond, 0)]) for a in (poses, *data))
+        slopes = np.concatenate([slopes, np.repeat(slopes[:, -1:], beyond, 1)], 1)
+        value, columns = self._look(inputs, moves, poses, slopes, function, rows)
+        return value[:frames], columns[:, :frames]
+
+    def _look(self, inputs: Inputs, moves: Inputs, poses, slopes, function: View, data):
+        arrays = ((poses, *_rest(inputs)), (slopes, *_rest(moves)), tuple(data))
         arguments = jax.tree.map(jnp.asarray, arrays)
         key = ("view", function)
         value, columns = self._run(None, key, functools.partial(look, function), arguments)
@@ -183,8 +196,14 @@ class Differentiator:
         return value, columns
 
     def _rollout(self, point: np.ndarray, frames: int) -> tuple[Inputs, Inputs, np.ndarray, np.ndarray]:
-        """(inputs, their tangents, poses, slopes) of at least ``frames`` frames; the last point's are kept."""
-        length = horizon(frames)
+        """(inputs, their tangents, poses, slopes) of ``frames`` frames, all finite."""
+        inputs, moves, poses, slopes = self._pushed(point, horizon(max(frames, self.frames)))
+        poses, slopes = poses[:frames], slopes[:, :frames]
+        require_finite(poses, slopes, self.space.names)
+        return inputs, moves, poses, slopes
+
+    def _pushed(self, point: np.ndarray, length: int) -> tuple[Inputs, Inputs, np.ndarray, np.ndarray]:
+        """``_rollout`` of a length that is compiled, finite or not; the last point's is kept."""
         key = (np.asarray(point, np.float64).tobytes(), length)
         if self._last is not None and self._last[0] == key:
             return self._last[1]

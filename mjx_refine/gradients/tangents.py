@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mjx_refine.batch import SceneBatch
-from mjx_refine.sim.leaves import Leaves
 from mjx_refine.sim.model import initial_state, model_fields
 from mjx_refine.space import Space
+
+if TYPE_CHECKING:
+    from mjx_refine.sim.leaves import Leaves
 
 STEP = 1e-6
 """Step in the unit box. The decoder is closed form in double precision: its differences are exact to about 1e-9."""
@@ -46,6 +48,9 @@ class Inputs(NamedTuple):
 
 def inputs_of(batch: SceneBatch) -> Inputs:
     """The inputs of every candidate, in double precision, with a leading batch axis."""
+    # It imports MJX, which takes its time.
+    from mjx_refine.sim.leaves import Leaves
+
     fields = model_fields(batch)
     leaves = Leaves(*(getattr(fields, field.name) for field in dataclasses.fields(fields)))
     camera = (batch.camera_position, batch.camera_pitch, batch.camera_fovy)
@@ -113,7 +118,10 @@ def kinked(space: Space, point: Float[np.ndarray, "dimension"]) -> Bool[np.ndarr
     batch = space.decode(np.concatenate([point[None], points.reshape(-1, len(point))]))
     result = np.zeros(len(point), bool)
     central = weights[:, 0] == 0.0
-    for array in jax.tree.leaves(inputs_of(batch)):
+    fields = model_fields(batch)
+    arrays = [getattr(fields, field.name) for field in dataclasses.fields(fields)]
+    arrays += [*initial_state(batch), batch.camera_position, batch.camera_pitch, batch.camera_fovy]
+    for array in arrays:
         change = array[1:].reshape(len(point), 2, -1) - array[0].reshape(-1)
         # Against the largest change in the array: a part that only curves changes by the step squared.
         scale = np.abs(change).max((1, 2), initial=0.0) + 1e-6 * STEP

@@ -41,6 +41,7 @@ def result_numbers(result: RefineResult, observation: Observation) -> dict[str, 
         "reason": result.reason,
         "steps": len(result.history),
         "parameters": [_parameter(row) for row in result.parameters],
+        "derivatives": _derivatives(result),
         "identification": _identification(result),
         "undetermined": [row.name for row in result.parameters if not row.determined],
         "fixed": [{"name": name, "reason": reason} for name, reason in result.fixed],
@@ -54,6 +55,12 @@ def result_numbers(result: RefineResult, observation: Observation) -> dict[str, 
 def _parameter(row: ParameterRow) -> dict:
     values = dataclasses.asdict(row)
     return {"name": values.pop("name"), "value": values.pop("after"), **values}
+
+
+def _derivatives(result: RefineResult) -> dict | None:
+    """Which derivatives could be trusted, and why; None where nobody looked."""
+    told = result.derivatives
+    return None if told is None else {"method": told.method, "reason": told.reason}
 
 
 def _identification(result: RefineResult) -> dict | None:

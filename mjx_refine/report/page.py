@@ -71,6 +71,7 @@ def report_page(result: RefineResult, observation: Observation, animation: bytes
         free=result.known.free[:5] if result.known is not None else (),
         loose=[row for row in result.parameters if not row.determined],
         options=_options(result),
+        trust=trust(result),
     )
 
 
@@ -88,6 +89,17 @@ def sentence(result: RefineResult) -> str:
         f"The overlap with the clip (IoU) {change} from {a:.3f} to {b:.3f} and the flow's end-point error {moved} from "
         f"{e:.3f} px to {f:.3f} px, starting from sample {result.start_index}, {time}."
     )
+
+
+def trust(result: RefineResult) -> str:
+    """Which derivatives could be trusted, in one sentence; empty where nobody looked."""
+    told = result.derivatives
+    if told is None:
+        return ""
+    kind = {"autodiff": "Automatic derivatives", "differences": "Differences of rollouts"}.get(told.method)
+    if kind is None:
+        return f"No derivative of this clip's simulation can be trusted where least squares ended: {told.reason}."
+    return f"{kind} of this clip's simulation can be trusted where least squares ended: {told.reason}."
 
 
 def warnings(result: RefineResult) -> list[str]:

@@ -2,7 +2,8 @@
 
 Levenberg-Marquardt (Marquardt 1963) on the maximum a posteriori problem: residuals are how far each silhouette reaches
 in 16 directions, beside what the masks show [px], and the distance from the start in prior widths. Derivatives are
-finite differences over rollouts, a whole Jacobian and a whole line search being one batch each. The horizon grows from
+finite differences over rollouts, a whole Jacobian and a whole line search being one batch each, or automatic ones
+through MJX. The horizon grows from
 the first frame to the last: an early collision must be right before what follows it means anything.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +21,9 @@ from mjx_refine.search.features import DIRECTIONS, POINTS, Outlines
 from mjx_refine.space import Space
 from mjx_refine.view.outline import supports
 from mjx_refine.view.points import point_flow
+
+if TYPE_CHECKING:
+    from mjx_refine.search.derivatives import Automatic
 
 DAMPINGS = np.array([1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0])
 """Multiples of the prior's curvature that one line search tries."""
@@ -40,6 +45,10 @@ FLOW_SCALE = 2.0
 
 NOISE_FLOOR = 0.5
 """Standard deviation of a mask's edge [px at a picture 480 wide]."""
+
+EDGE_WEIGHT = float(np.sqrt(6 / DIRECTIONS)) / NOISE_FLOOR
+MOTION_WEIGHT = float(np.sqrt(2 / POINTS)) / FLOW_NOISE
+"""Of one direction of an outline, and of one coordinate of the flow at one point [1 / px at a picture 480 wide]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,6 +103,7 @@ class LeastSquares:
       limit: rollouts that may be spent.
       seed: of the points tried when the horizon grows.
       solver: what runs inside a stage: ``lm``, ours, or one of ``solvers``.
+      automatic: derivatives where it has some; None: differences alone.
     """
 
     def __init__(
@@ -107,8 +117,9 @@ class LeastSquares:
         limit: int = 10**9,
         seed: int = 0,
         solver: str = "lm",
+        automatic: Automatic | None = None,
     ):
-        self.limit, self.seed, self.solver = limit, seed, solver
+        self.limit, self.seed, self.solver, self.automatic = limit, seed, solver, automatic
         self.space, self.rollout, self.image = space, rollout, image
         self.pixel = image[0] / 480.0
         target = np.full((len(seen.support), len(columns), DIRECTIONS), np.nan)
@@ -148,8 +159,8 @@ class LeastSquares:
         def slowed(raw: np.ndarray, scale: float) -> np.ndarray:
             return np.sign(raw) * scale * np.sqrt(np.log1p((raw / scale) ** 2))
 
-        edges = slowed(np.nan_to_num(reach), scale) * (np.sqrt(6 / DIRECTIONS) / NOISE_FLOOR)
-        motion = slowed(np.nan_to_num(flow), FLOW_SCALE) * (np.sqrt(2 / POINTS) / FLOW_NOISE)
+        edges = slowed(np.nan_to_num(reach), scale) * EDGE_WEIGHT
+        motion = slowed(np.nan_to_num(flow), FLOW_SCALE) * MOTION_WEIGHT
         return np.concatenate([edges, motion], -1)
 
     def residuals(self, points: np.ndarray, frames: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
@@ -161,12 +172,38 @@ class LeastSquares:
         return robust, np.where(bad, np.inf, cost)
 
     def jacobian(self, point: np.ndarray, base: np.ndarray, frames: int, scale: float) -> np.ndarray:
-        """d residuals / d (prior widths) by finite differences, towards the inside of the box, (R, D)."""
-        step = 0.05 * self.space.sigma
-        sign = np.where(point + step > 1.0, -1.0, 1.0)
-        points = point + np.diag(sign * step)
-        moved, _ = self.residuals(np.clip(points, 0.0, 1.0), frames, scale)
-        return ((moved - base) / (sign[:, None] * 0.05)).T
+        """d residuals / d (prior widths), (R, D): automatic, or else finite differences towards the inside of the box."""
+        result, held = np.zeros((len(base), len(point))), np.zeros(len(point), bool)
+        with_flow = self.flow is not None and frames > 1
+        told = self.automatic and self.automatic(point, frames, self.image, self.pixels if with_flow else None)
+        if told:
+            columns, held = told
+            # A tangent is pushed through one rollout.
+            self.spent += len(columns) * frames / len(self.target)
+            slopes = self._robust_slopes(base.reshape(columns.shape[1:]), frames, scale)
+            result[:, held] = (columns / self.pixel * slopes).reshape(len(columns), -1).T
+        if not held.all():
+            step = 0.05 * self.space.sigma
+            sign = np.where(point + step > 1.0, -1.0, 1.0)
+            points = (point + np.diag(sign * step))[~held]
+            moved, _ = self.residuals(np.clip(points, 0.0, 1.0), frames, scale)
+            result[:, ~held] = ((moved - base) / (sign[~held, None] * 0.05)).T
+        return result
+
+    def _robust_slopes(self, base: np.ndarray, frames: int, scale: float) -> np.ndarray:
+        """Derivatives of ``_robust`` in the raw distances, told from its own values; zero where nothing was seen."""
+        seen = np.isfinite(self.target[:frames])
+        factors = np.full(base.shape[-1], EDGE_WEIGHT)
+        scales = np.full(base.shape[-1], scale)
+        factors[DIRECTIONS:], scales[DIRECTIONS:] = MOTION_WEIGHT, FLOW_SCALE
+        if self.flow is not None and frames > 1:
+            measured = np.isfinite(self.flow[:frames]).reshape(*seen.shape[:2], -1)
+            measured[frames - 1] = False
+            seen = np.concatenate([seen, measured], -1)
+        # With q = raw / scale and L = log(1 + q^2) the residual is sqrt(L), and its derivative q / ((1 + q^2) sqrt(L)).
+        grown = (base / factors / scales) ** 2
+        slopes = np.sqrt(np.expm1(grown) / np.maximum(grown, 1e-300)) * np.exp(-grown)
+        return np.where(seen, np.where(grown > 1e-12, slopes, 1.0) * factors, 0.0)
 
     @property
     def evaluations(self) -> int:

@@ -10,6 +10,8 @@ from mjx_refine.errors import InputError
 
 OPTIMIZERS = ("hybrid", "cmaes", "gradient")
 
+DERIVATIVES = ("auto", "differences", "autodiff")
+
 SOLVERS = ("lm", "adam", "gauss-newton", "levenberg-marquardt")
 
 
@@ -22,9 +24,11 @@ class Options:
       population: candidates a generation.
       iterations: generations; population * iterations is the budget of rollouts, whatever the optimiser spends them on.
       optimizer: ``cmaes`` searches from the best sample; ``gradient`` is least squares alone (Levenberg-Marquardt on
-        outlines, finite differences); ``hybrid`` lands with least squares and searches from there with the rest.
+        outlines); ``hybrid`` lands with least squares and searches from there with the rest.
       solver: of each stage of least squares: ``lm``, our own Levenberg-Marquardt, which tries several step lengths at
         once; ``adam`` (optax); ``gauss-newton`` and ``levenberg-marquardt`` (jaxopt).
+      derivatives: of least squares: ``differences`` of rollouts in C MuJoCo; ``autodiff`` through MJX-JAX, where a check
+        finds that they hold; ``auto``: differences, about a thousand times cheaper on a CPU.
       backend: ``mujoco`` (C, all cores), ``mjx``, ``warp``, or ``auto`` for the fastest here.
       resolution: (width, height) at which the search compares pictures; None: about 160 wide. Reported scores are
         always at full resolution.
@@ -39,6 +43,7 @@ class Options:
     iterations: int = 100
     optimizer: str = "hybrid"
     solver: str = "lm"
+    derivatives: str = "auto"
     backend: str = "auto"
     resolution: tuple[int, int] | None = None
     weights: Weights = dataclasses.field(default_factory=Weights)
@@ -51,6 +56,8 @@ class Options:
             raise InputError(f"optimizer = {self.optimizer!r}; expected one of {', '.join(OPTIMIZERS)}")
         if self.solver not in SOLVERS:
             raise InputError(f"solver = {self.solver!r}; expected one of {', '.join(SOLVERS)}")
+        if self.derivatives not in DERIVATIVES:
+            raise InputError(f"derivatives = {self.derivatives!r}; expected one of {', '.join(DERIVATIVES)}")
         for name, low, high in (
             ("population", 4, 65536),
             ("iterations", 1, 10**6),

@@ -100,6 +100,7 @@ def refine(
             "search": round(found.searched, 3),
         },
         problems=samples.problems,
+        derivatives=found.derivatives,
     )
 
 

@@ -10,6 +10,7 @@ from mjx_fitness import Scores
 
 from mjx_refine.scene import Problem as SampleProblem
 from mjx_refine.scene import Scene
+from mjx_refine.search.derivatives import Derivatives
 from mjx_refine.search.intervals import Intervals
 from mjx_refine.search.options import Options
 from mjx_refine.search.progress import Step
@@ -71,6 +72,7 @@ class RefineResult:
       backend, device: what searched; the scores are always C MuJoCo's.
       seconds: total, compile, search.
       problems: samples that could not be read.
+      derivatives: which could be trusted where the landings ended; None where nobody looked.
     """
 
     options: Options
@@ -90,6 +92,7 @@ class RefineResult:
     device: str
     seconds: dict[str, float]
     problems: tuple[SampleProblem, ...] = ()
+    derivatives: Derivatives | None = None
 
     @property
     def scene(self) -> Scene:

@@ -13,7 +13,9 @@ from mjx_fitness import Scores
 
 from mjx_refine.scene import Scene
 from mjx_refine.search.checkpoint import damaged, digest, load_checkpoint, save_checkpoint
+from mjx_refine.search.derivatives import DerivativeChoice, Derivatives
 from mjx_refine.search.intervals import Intervals, intervals
+from mjx_refine.search.landed import LANDED_WELL, Landed, first_covariance
 from mjx_refine.search.landing import LeastSquares, stages
 from mjx_refine.search.objective import Objective
 from mjx_refine.search.problem import Problem, Start
@@ -25,18 +27,8 @@ from mjx_refine.space import Space
 SEARCH_WIDTH = 160
 """Samples across a picture during the search, by default."""
 
-LANDED_WELL = 0.93
-"""IoU above which nothing more is tried before the population search."""
-
 LANDING_SHARE = 0.6
 """Part of the budget that least squares may spend before the population search (``hybrid``)."""
-
-NARROW = (0.25, 0.05)
-"""After a good landing, the first generation's (factor on the variance that the landing found, prior widths that it may
-spread where the landing left a parameter open). More, and contacts beyond those landed on spoil nearly every candidate."""
-
-WIDE = (4.0, 0.2)
-"""The same after a poor landing, which the population search must leave again."""
 
 GENERATIONS = 40
 """Generations for which the budget after a landing must suffice; the population shrinks, down to CMA-ES's default
@@ -46,17 +38,6 @@ ELITES = 8
 """Candidates of the search that are compared at full resolution in the end."""
 
 CHECKPOINT_SECONDS = 1.0
-
-
-@dataclasses.dataclass
-class Landed:
-    """A start and where least squares took it."""
-
-    rank: int
-    point: np.ndarray
-    covariance: np.ndarray
-    fitness: float
-    iou: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +50,7 @@ class Found:
       values: of the space's parameters.
       undetermined: names of those on which the score does not depend.
       known: intervals of the parameters, None if none were asked for or the best sample was kept as it came.
+      derivatives: which could be trusted where the landings ended.
       history, evaluations, reason: the way there.
       backend, device: what searched.
       searched: seconds of the population search.
@@ -81,6 +63,7 @@ class Found:
     values: tuple[float, ...]
     undetermined: tuple[str, ...]
     known: Intervals | None
+    derivatives: Derivatives
     history: tuple[Step, ...]
     evaluations: int
     reason: str
@@ -101,7 +84,7 @@ class Run:
 
     def __init__(self, problem: Problem, progress: Progress, checkpoint: Path | None, resume: bool):
         self.problem, self.options, self.progress = problem, problem.options, progress
-        self.path = checkpoint
+        self.path, self.choice = checkpoint, DerivativeChoice(problem, progress.message)
         self.began = time.monotonic()
         observation = problem.observation
         parts = [observation.flow, observation.fps, problem.samples.scenes, dataclasses.asdict(self.options)]
@@ -138,6 +121,7 @@ class Run:
         if self.options.optimizer != "cmaes":
             self._land()
         start, space, mean, covariance = self._beginning()
+        derivatives = self.choice.final(start, space, mean)
         reason = "Least squares converged."
         elites = [mean]
         simulator_name, device = "mujoco", "cpu"
@@ -150,6 +134,7 @@ class Run:
             elites += found
         return Found(
             **self._finish(start, space, elites, self._objective(start, space)),
+            derivatives=derivatives,
             history=tuple(self.history),
             evaluations=self.evaluations,
             reason=reason,
@@ -191,6 +176,7 @@ class Run:
         start = self.problem.starts[rank]
         space = Space.around(start.scene)
         squares = self._squares(start, space, limit)
+        squares.automatic = self.choice.automatic(start, space)
         objective = self._objective(start, space)
         before = self.evaluations
 
@@ -225,7 +211,7 @@ class Run:
             best = max(self.landed, key=lambda landed: landed.fitness)
             start = self.problem.starts[best.rank]
             space = Space.around(start.scene)
-            return start, space, best.point, _first_covariance(best, space)
+            return start, space, best.point, first_covariance(best, space)
         start = self.problem.starts[0]
         space = Space.around(start.scene)
         return start, space, space.start, np.diag(space.sigma**2)
@@ -372,16 +358,6 @@ class Run:
             self._best = tuple(values["best"])
             self._saved = (values, arrays)
         self.progress.message(f"resumed after {self.evaluations} rollouts")
-
-
-def _first_covariance(landed: Landed, space: Space) -> np.ndarray:
-    """Covariance of the first generation after a landing, unit box."""
-    factor, widths = NARROW if landed.iou >= LANDED_WELL else WIDE
-    scale = np.outer(space.sigma, space.sigma)
-    # In prior widths the landing's inverse covariance is what the clip told, plus one for the prior.
-    told = np.linalg.inv(landed.covariance / scale) - np.eye(space.dimension)
-    covariance = np.linalg.inv(told / factor + np.eye(space.dimension) / widths**2) * scale
-    return (covariance + covariance.T) / 2
 
 
 def _merge(

@@ -23,6 +23,7 @@ from mjx_refine.report.numbers import plain
 from mjx_refine.report.page import report_page
 from mjx_refine.report.tables import number, parameter_groups
 from mjx_refine.scene import Body, Camera, Problem, Scene, load_scene
+from mjx_refine.search.derivatives import Derivatives
 from mjx_refine.search.intervals import FreeDirection, Intervals
 from mjx_refine.search.options import Options
 from mjx_refine.search.progress import Step
@@ -103,6 +104,7 @@ def made_up(name: str = HOSTILE, iou: float = 0.9) -> RefineResult:
         device="cpu",
         seconds={"total": 12.5, "compile": 1.0, "search": 10.0},
         problems=(Problem(4, "radius = '<img src=x>'"),),
+        derivatives=Derivatives("differences", f"wide differences agree; no derivative here in {name}.size.x", 5),
     )
 
 
@@ -193,6 +195,7 @@ def test_the_page_says_what_a_reader_must_know(written):
         "0.5 (28.65°) 0.75 (42.97°) rad +0.25 (14.3°)",
         "one prior width changes nothing",
         "only ratios of masses act",
+        "Differences of rollouts of this clip's simulation can be trusted where least squares ended: wide differences agree",
     ):
         assert words in text
     assert "poor" not in text
@@ -240,6 +243,8 @@ def test_json_has_the_contracts_keys_and_no_nan(written):
         {"name": HOSTILE, "mask_id": 1, "iou": 0.9},
         {"name": "ball", "mask_id": None, "iou": None},
     ]
+    reason = f"wide differences agree; no derivative here in {HOSTILE}.size.x"
+    assert numbers["derivatives"] == {"method": "differences", "reason": reason}
     assert numbers["undetermined"] == ["ball.damping"]
     assert numbers["problems"] == [{"index": 4, "reason": "radius = '<img src=x>'"}]
 
