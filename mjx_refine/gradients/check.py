@@ -11,7 +11,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mjx_refine.gradients.finite import DerivativeError
 from mjx_refine.gradients.tangents import kinked, stencil
@@ -86,21 +86,24 @@ def differences(
     simulator: MujocoSimulator,
     image: tuple[int, int],
     directions: int = DIRECTIONS,
-) -> Float[np.ndarray, "dimension frames objects directions"]:
+    chosen: Int[np.ndarray, "some"] | None = None,
+) -> Float[np.ndarray, "some frames objects directions"]:
     """Derivatives of outlines [px per prior width] by second-order differences of C MuJoCo in double precision.
 
-    ``step`` is in prior standard deviations. NaN where a rollout diverged.
+    ``step`` is in prior standard deviations; ``chosen`` are the parameters, all if None. NaN where a rollout diverged.
     """
     point = np.clip(np.asarray(point, np.float64), 0.0, 1.0)
     size = np.minimum(step * space.sigma, 0.25)
     points, weights = stencil(point, size)
+    rows = np.arange(len(point)) if chosen is None else chosen
+    points, weights = points[rows], weights[rows]
     batch = space.decode(np.concatenate([point[None], points.reshape(-1, len(point))]))
     poses = simulator.rollout(batch, frames)
     arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
     reach = precise_outlines(space.scene.shapes, tuple(map(np.asarray, arrays)), image, directions)
-    moved = reach[1:].reshape(len(point), 2, *reach.shape[1:]) - reach[0]
+    moved = reach[1:].reshape(len(rows), 2, *reach.shape[1:]) - reach[0]
     slopes = np.einsum("dk,dk...->d...", weights[:, 1:], moved)
-    return slopes * space.sigma[:, None, None, None]
+    return slopes * space.sigma[rows, None, None, None]
 
 
 def check(
@@ -111,6 +114,7 @@ def check(
     fps: float = 30.0,
     autodiff: Differentiator | None = None,
     simulator: MujocoSimulator | None = None,
+    most: int | None = None,
 ) -> Verdict:
     """Compares derivatives of what is seen at ``point`` and chooses between them.
 
@@ -124,6 +128,7 @@ def check(
       fps: frames a second, where no simulator says it.
       autodiff: without it (compiling MJX takes its time on a CPU) the choice is between the other two.
       simulator: the reference; made here if None.
+      most: parameters that are looked at, evenly spread over all, where that is enough; None: all.
 
     Raises:
       ValueError: the point lies outside of the box, or the frame rates differ.
@@ -134,9 +139,12 @@ def check(
     if autodiff is not None and simulator.fps != fps:
         raise ValueError(f"{simulator.fps} frames a second in MuJoCo, {fps} in MJX; expected the same")
     kinks = kinked(space, point)
+    rows = np.nonzero(~kinks)[0]
+    if most is not None and most < len(rows):
+        rows = rows[np.linspace(0, len(rows) - 1, most).round().astype(int)]
 
     def slopes_over(step: float) -> np.ndarray:
-        return differences(space, point, frames, step, simulator, image)[~kinks]
+        return differences(space, point, frames, step, simulator, image, chosen=rows)
 
     wide, middle = (slopes_over(step) for step in STEPS[:2])
     along, fine, problem = None, None, ""
@@ -144,8 +152,8 @@ def check(
         narrow = slopes_over(STEPS[2])
         fine = cosines(middle, narrow)
         try:
-            slopes = autodiff.outlines(point, frames, image, DIRECTIONS)[1] * space.sigma[:, None, None, None]
-            along = np.minimum(cosines(slopes[~kinks], middle), cosines(slopes[~kinks], narrow))
+            slopes = autodiff.outlines(point, frames, image, DIRECTIONS)[1][rows] * space.sigma[rows, None, None, None]
+            along = np.minimum(cosines(slopes, middle), cosines(slopes, narrow))
         except DerivativeError as error:
             problem = str(error)
     names = tuple(np.array(space.names)[kinks].tolist())

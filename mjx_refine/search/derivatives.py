@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 WORK = 40_000
 """Rollouts x frames x objects that a check may take: half a second of C MuJoCo on two cores."""
 
-LEAST_FRAMES = 8
-"""Frames that a check looks at however many objects there are."""
+LEAST_PARAMETERS = 12
+"""Parameters that a check looks at however long the clip is; the clip is cut before."""
 
 UNCOMPILED = (InputError, jax.errors.JaxRuntimeError)
 """Another MJX than the derivatives were written for; XLA without enough memory."""
@@ -127,12 +127,14 @@ class DerivativeChoice:
     def judge(self, start: Start, space: Space, point: Float[np.ndarray, "dimension"]) -> Derivatives:
         """Whether derivatives at ``point`` tell what is around it; automatic ones only if they were asked for."""
         length, simulator = self.problem.observation.length, self.problem.reference(start.scene.shapes)
-        frames = frames_within(length, space)
+        frames, most = extent(length, space)
         compare = functools.partial(
-            check, space, point, frames, self.problem.observation.size, simulator.fps, simulator=simulator
+            check, space, point, frames, self.problem.observation.size, simulator.fps, simulator=simulator, most=most
         )
         told, problem = self._compared(compare, space)
         reason = told.reason + problem
+        if most < space.dimension:
+            reason += f"; {most} of {space.dimension} parameters were looked at"
         if frames < length:
             reason += f"; the first {frames} of {length} frames were looked at"
         until = (
@@ -170,7 +172,9 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [""])[0]
 
 
-def frames_within(length: int, space: Space) -> int:
-    """How many of a clip's frames a check of two widths of differences looks at, to stay within ``WORK``."""
-    rollouts = 2 * (2 * space.dimension + 1)
-    return min(length, max(LEAST_FRAMES, WORK // (rollouts * len(space.scene.shapes))))
+def extent(length: int, space: Space) -> tuple[int, int]:
+    """(frames, parameters) that a check of two widths of differences looks at, to stay within ``WORK``."""
+    objects = len(space.scene.shapes)
+    most = max(LEAST_PARAMETERS, (WORK // (objects * length) - 2) // 4)
+    most = min(most, space.dimension)
+    return min(length, max(2, WORK // (objects * (4 * most + 2)))), most

@@ -96,19 +96,6 @@ class Problem:
         """For each object the column of ``seen`` that it is matched to, or -1."""
         return tuple(-1 if i == UNMATCHED else self.seen.ids.index(i) for i in matching)
 
-    def one_of_each_kind_first(self) -> list[int]:
-        """Rows of ``starts``: the best of every scene kind, then the second best of every kind, and so on.
-
-        A language model's samples agree on the shapes; where samples do not (``guess``), the outlines of the best one
-        may owe more to its camera than to its shapes.
-        """
-        seen: dict[tuple[Shape, ...], int] = defaultdict(int)
-        turns = []
-        for row, start in enumerate(self.starts):
-            turns.append((seen[start.scene.shapes], row))
-            seen[start.scene.shapes] += 1
-        return [row for _, row in sorted(turns)]
-
     def _ranked(self) -> list[Start]:
         """All samples, best fitness first."""
         kinds: dict[tuple[Shape, ...], list[int]] = defaultdict(list)

@@ -155,7 +155,7 @@ class Run:
         contact, then from further samples."""
         share = LANDING_SHARE if self.options.optimizer == "hybrid" else 1.0
         limit = int(share * self.options.budget)
-        ranks, count = self.problem.one_of_each_kind_first(), self.options.starts
+        ranks, count = range(len(self.problem.starts)), self.options.starts
         plan = [(rank, 0) for rank in ranks[:count]] + [(-1, 2)]
         plan += [(rank, 0) for rank in ranks[count : 3 * count]] + [(-1, 2)]
         for step, (rank, hops) in enumerate(plan):

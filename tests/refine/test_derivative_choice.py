@@ -14,13 +14,13 @@ import pytest
 from mjx_refine.batch import batch_from_scenes
 from mjx_refine.cli import commands
 from mjx_refine.errors import InputError
-from mjx_refine.gradients import DerivativeError, Differentiator
+from mjx_refine.gradients import DerivativeError, Differentiator, check
 from mjx_refine.observation import Observation
 from mjx_refine.report.numbers import result_numbers
 from mjx_refine.report.page import trust
 from mjx_refine.scene import Body, Camera, Scene
 from mjx_refine.search import Options, Progress, refine
-from mjx_refine.search.derivatives import LEAST_FRAMES, WORK, Automatic, _simulator, frames_within
+from mjx_refine.search.derivatives import LEAST_PARAMETERS, WORK, Automatic, _simulator, extent
 from mjx_refine.search.features import flow_points, outlines
 from mjx_refine.search.landing import LeastSquares, stages
 from mjx_refine.search.options import DERIVATIVES
@@ -218,12 +218,28 @@ def test_a_verdict_is_in_every_result_and_in_its_json_and_the_same_when_resumed(
 def test_a_check_stays_within_its_work():
     one = Space.around(FLIGHT)
     crowd = Space.around(Scene(tuple(dataclasses.replace(DIE, name=f"d{i}") for i in range(8)), CAMERA))
-    assert frames_within(30, one) == 30
-    for space, length in ((one, 10**4), (crowd, 300)):
-        frames = frames_within(length, space)
-        work = frames * 2 * (2 * space.dimension + 1) * len(space.scene.shapes)
-        assert LEAST_FRAMES <= frames < length
-        assert work <= WORK or frames == LEAST_FRAMES
+    assert extent(30, one) == (30, one.dimension)
+    assert extent(60, crowd)[0] == 60
+    for space, length in ((one, 10**4), (crowd, 60), (crowd, 10**4)):
+        frames, most = extent(length, space)
+        assert frames * (4 * most + 2) * len(space.scene.shapes) <= WORK
+        assert LEAST_PARAMETERS <= most <= space.dimension
+
+
+def test_a_part_of_the_parameters_tells_of_all():
+    space, simulator = Space.around(CHAOS), MujocoSimulator(CHAOS.shapes, 30.0, 1)
+    rows = []
+
+    class Counting:
+        fps = 30.0
+
+        def rollout(self, batch, frames):
+            rows.append(len(batch))
+            return simulator.rollout(batch, frames)
+
+    told = check(space, space.start, 40, SIZE, simulator=Counting(), most=6)
+    assert rows == [13, 13]
+    assert told.method == "population"
 
 
 def test_a_search_without_automatic_derivatives_does_not_import_mjx():
