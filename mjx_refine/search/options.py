@@ -28,7 +28,7 @@ class Options:
       solver: of each stage of least squares: ``lm``, our own Levenberg-Marquardt, which tries several step lengths at
         once; ``adam`` (optax); ``gauss-newton`` and ``levenberg-marquardt`` (jaxopt).
       derivatives: of least squares: ``differences`` of rollouts in C MuJoCo; ``autodiff`` through MJX-JAX, where a check
-        finds that they hold; ``auto``: differences, about a thousand times cheaper on a CPU.
+        finds that they hold; ``auto``: differences, far cheaper on a CPU.
       backend: ``mujoco`` (C, all cores), ``mjx``, ``warp``, or ``auto`` for the fastest here.
       resolution: (width, height) at which the search compares pictures; None: about 160 wide. Reported scores are
         always at full resolution.
