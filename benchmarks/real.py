@@ -22,14 +22,15 @@ CLIPS = {
     "carom_big_collision": {"fps": 240, "start": 0.125, "end": 0.575, "stride": 4},
     "carom_rotation": {"fps": 240, "start": 0.125, "end": 0.625, "stride": 4},
     "greenball_small_960x540": {"start": 0.434, "end": 2.169, "stride": 1, "size": "480x270"},
+    "greenball_small_960x540, first second": {"start": 0.434, "end": 1.434, "stride": 1, "size": "480x270"},
     "rolling_cylinder": {"fps": 240, "start": 0.3584, "end": 1.325, "stride": 8},
     "projectile_45deg_2.687mps": {"fps": 240, "start": 0.121, "end": 0.55, "stride": 3},
     "sliding_R1": {"fps": 240, "start": 0.3334, "end": 1.375, "stride": 8},
 }
-"""What of each file is used; start and end are seconds of the file's time."""
+"""What of each file is used (its name is what stands before a comma); start and end are seconds of the file's time."""
 
 
-def run(video: Path, selection: dict, out: Path, options: Options) -> str:
+def run(name: str, video: Path, selection: dict, out: Path, options: Options) -> str:
     """One clip from file to report; returns a row of the table."""
     began = time.monotonic()
     observation = observe_clip(video, **selection).observation
@@ -42,7 +43,7 @@ def run(video: Path, selection: dict, out: Path, options: Options) -> str:
     write_result(out, result, observation)
     before, after = result.init.scores, result.refined.scores
     return (
-        f"| {video.stem} | {observation.length} | {before.iou[0]:.3f} | {after.iou[0]:.3f} | "
+        f"| {name} | {observation.length} | {before.iou[0]:.3f} | {after.iou[0]:.3f} | "
         f"{after.first_frame_iou[0]:.3f} | {after.epe[0]:.3f} | {' '.join(result.scene.shapes)} | "
         f"{time.monotonic() - began:.0f} |"
     )
@@ -63,7 +64,11 @@ def main() -> None:
     print("| --- " * 8 + "|", flush=True)
     for name, selection in CLIPS.items():
         if any(word in name for word in arguments.only.split(",")):
-            print(run(arguments.videos / f"{name}.mp4", selection, arguments.out / name, options), flush=True)
+            video = arguments.videos / f"{name.split(',')[0]}.mp4"
+            print(
+                run(name, video, selection, arguments.out / name.replace(", ", "-").replace(" ", "-"), options),
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -151,6 +151,8 @@ def _doubt(known: Intervals, j: int) -> str:
     """Why refits do not agree on parameter ``j``, or empty."""
     if known.on_bound[j]:
         return "on the edge of what is searched"
+    if known.standard_error[j] > 0.95:
+        return "the clip says nothing about it"
     if not known.determined[j]:
         return f"the clip narrows its prior to {known.standard_error[j]:.0%} only"
     return ""
