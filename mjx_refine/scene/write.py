@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -11,7 +12,7 @@ from mjx_refine import files
 from mjx_refine.scene.model import Body, Scene
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     """``value`` in Python's own numbers: numpy's are floats, but YAML does not know them."""
     if isinstance(value, dict):
         return {key: _plain(v) for key, v in value.items()}
