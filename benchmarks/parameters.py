@@ -51,7 +51,7 @@ def write_scenes(folder: Path, seed: int, count: int) -> None:
     """Truths of every kind of motion with 1-4 objects, as YAML, and samples beside them."""
     from benchmarks.clips.clip import mask_fault
     from benchmarks.clips.folders import plan
-    from benchmarks.clips.samples import _Noise, guess_scene
+    from benchmarks.clips.samples import Noise, guess_scene
     from benchmarks.clips.scenes import draw_scene
     from benchmarks.clips.writing import samples_text, scene_text
 
@@ -66,7 +66,7 @@ def write_scenes(folder: Path, seed: int, count: int) -> None:
             if observation is not None and mask_fault(np.asarray(observation.masks), objects, FRAMES) is None:
                 break
         own = np.random.default_rng([seed, index, 1])
-        noise = _Noise(int(own.integers(2**31)), own)
+        noise = Noise(int(own.integers(2**31)), own)
         guesses = [guess_scene(truth, SIZE, noise, 1.0, 1.0, 2) for _ in range(SAMPLES)]
         write_text(folder / f"{name}.samples.yaml", samples_text(guesses, tagged=False, seed=index))
         print(name, f"try {again + 1}", flush=True)

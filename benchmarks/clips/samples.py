@@ -40,7 +40,7 @@ class SampleSet:
     first_iou: Float[np.ndarray, "samples"]
 
 
-class _Noise:
+class Noise:
     """Standard normal errors, each the sum of a part common to the clip and one of this sample's own."""
 
     def __init__(self, clip_seed: int, own: np.random.Generator):
@@ -52,7 +52,7 @@ class _Noise:
 
 
 def guess_scene(
-    truth: list[Entry], size: tuple[int, int], noise: _Noise, still: float, moving: float, digits: int
+    truth: list[Entry], size: tuple[int, int], noise: Noise, still: float, moving: float, digits: int
 ) -> list[Entry]:
     """One guess, rounded as it is written.
 
@@ -78,7 +78,7 @@ def _guess_object(
     original: Entry,
     before: Camera,
     after: Camera,
-    noise: _Noise,
+    noise: Noise,
     still: float,
     moving: float,
     digits: int,
@@ -118,7 +118,7 @@ def _guess_object(
     physics["damping"] = -int(np.clip(round(-physics["damping"] * np.exp(noise(0.7))), 1, 150))
 
 
-def _guess_turn(original: Entry, lift: float, noise: _Noise, still: float) -> list[float]:
+def _guess_turn(original: Entry, lift: float, noise: Noise, still: float) -> list[float]:
     """The orientation with a wrong yaw; what rests stays flat up to rounding."""
     q = np.array(original["state"]["orientation"])
     yaw, tilt = noise(np.radians(14) * still), noise(np.radians(8) * still, (3,))
@@ -130,7 +130,7 @@ def _guess_turn(original: Entry, lift: float, noise: _Noise, still: float) -> li
     return [_round(v, 2) for v in q / np.linalg.norm(q)]
 
 
-def _guess_motion(state: Entry, original: Entry, ratio: float, noise: _Noise, moving: float, digits: int) -> None:
+def _guess_motion(state: Entry, original: Entry, ratio: float, noise: Noise, moving: float, digits: int) -> None:
     velocity = np.array(original["linear_velocity"])
     turn = rotation.matrix(rotation.about(np.array([0.0, 0, 1]), noise(0.35 * moving)))
     velocity = turn @ velocity * ratio * np.exp(np.clip(noise(0.45 * moving), -0.8, 0.7))
@@ -178,7 +178,7 @@ class _Guesser:
     def guess(self, still: float, moving: float) -> list[Entry]:
         digits = int(self.rng.integers(1, 3))
         size = (self._masks.shape[2], self._masks.shape[1])
-        return guess_scene(self._truth, size, _Noise(self._clip_seed, self.rng), still, moving, digits)
+        return guess_scene(self._truth, size, Noise(self._clip_seed, self.rng), still, moving, digits)
 
     def curve(self, scene: list[Entry], frames: int | None = None, every: int = 1) -> Float[np.ndarray, "frames"]:
         return sample_iou(scene, self._masks[:frames], fps=self._fps, stride=self._stride, every=every)

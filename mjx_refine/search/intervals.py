@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import stats
 
-from mjx_refine.search.landing import LeastSquares
+from mjx_refine.search.landing import LeastSquares, slowed
 from mjx_refine.space import Space
 
 CONFIDENCE = 0.90
@@ -36,7 +36,7 @@ EDGE_FLOOR = 0.15
 MOTION_FLOOR = 0.2
 """The same of flow: more than a simulation without noise would need, but contacts are not right to less."""
 
-HUBER = 2.5
+CAUCHY = 2.5
 """Residuals beyond this many standard deviations count less (Cauchy's loss)."""
 
 STEP = 0.05
@@ -58,6 +58,9 @@ and no clip tells."""
 
 RIDGES = (0.0, 0.1, 1.0, 10.0, 100.0)
 TRIALS = np.array([1e-4, 1e-2, 1.0, 1e2, 1e4])
+
+SCALED = ("m", "m/s", "m/s^2")
+"""Units of what the overall scale multiplies."""
 
 ON_BOUND = 1e-3
 """Distance to a bound in the unit box within which a parameter is said to lie on it."""
@@ -136,7 +139,7 @@ class _Posterior:
         raw = np.concatenate(
             [np.nan_to_num(reach) / self.edge[:, None], np.nan_to_num(flow) / self.motion[:, None]], -1
         ).reshape(len(points), -1)
-        robust = np.sign(raw) * HUBER * np.sqrt(np.log1p((raw / HUBER) ** 2))
+        robust = slowed(raw, CAUCHY)
         prior = (points - self.space.start) / self.space.sigma
         cost = 0.5 * (robust**2).sum(-1) + 0.5 * (prior**2).sum(-1)
         return robust, np.where(bad, np.inf, cost)
@@ -239,7 +242,7 @@ def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refi
     Args:
       squares: the residuals.
       point: the solution, unit box.
-      refits: how many, at least 2.
+      refits: how many, at least 1.
       seed: of their starts.
     """
     before = squares.evaluations
@@ -252,6 +255,8 @@ def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refi
     first = posterior.fit(point)
     first = posterior.spread(first.point, _axes(first.covariance), SETTLE)
     posterior.measure_noise(first.point)
+    # Costs are compared with those of the refits, at the same noise.
+    first = dataclasses.replace(first, cost=float(posterior(first.point[None])[1][0]))
     generator = np.random.default_rng([seed, 17])
     fits = [first]
     for _ in range(refits):
@@ -288,17 +293,13 @@ def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refi
 
 def _scale_direction(space: Space, point: np.ndarray) -> np.ndarray:
     """Change of every parameter [prior widths] where all lengths grow by one e-fold, seen from the camera's foot."""
-    values = space.values(point)
-    camera = dict(zip(space.names, values, strict=True)).get("camera.height")
     result = np.zeros(space.dimension)
-    if camera is None:
+    if "camera.height" not in space.names:
         return result
-    for j, (parameter, value) in enumerate(zip(space.parameters, values, strict=True)):
+    for j, (parameter, value) in enumerate(zip(space.parameters, space.values(point), strict=True)):
         if parameter.field == "position":
             change = value - space.scene.camera.position[parameter.index[1]]
-        elif (
-            parameter.field in ("clearance", "linear_velocity") or parameter.unit == "m" or parameter.field == "gravity"
-        ):
+        elif parameter.unit in SCALED:
             change = value
         else:
             continue
@@ -311,7 +312,7 @@ def _free(space: Space, covariance: np.ndarray) -> tuple[FreeDirection, ...]:
     variances, directions = np.linalg.eigh(covariance)
     result = []
     for j in np.argsort(variances)[::-1]:
-        spread = float(np.sqrt(variances[j]))
+        spread = float(np.sqrt(max(variances[j], 0.0)))
         weights = directions[:, j] * np.sign(directions[np.argmax(np.abs(directions[:, j])), j])
         order = [int(k) for k in np.argsort(-np.abs(weights)) if abs(weights[k]) > 0.25]
         if spread > DETERMINED and len(order) > 1:

@@ -3,8 +3,8 @@
 Levenberg-Marquardt (Marquardt 1963) on the maximum a posteriori problem: residuals are how far each silhouette reaches
 in 16 directions, beside what the masks show [px], and the distance from the start in prior widths. Derivatives are
 finite differences over rollouts, a whole Jacobian and a whole line search being one batch each, or automatic ones
-through MJX. The horizon grows from
-the first frame to the last: an early collision must be right before what follows it means anything.
+through MJX. The horizon grows from the first frame to the last: an early collision must be right before what follows it
+means anything.
 """
 
 from __future__ import annotations
@@ -155,10 +155,6 @@ class LeastSquares:
         Their growth slows beyond ``scale`` but never ends: a pull at any distance. Neither the edges of one mask nor the
         flow at its points are independent: its directions together count as six, its flow as two vectors.
         """
-
-        def slowed(raw: np.ndarray, scale: float) -> np.ndarray:
-            return np.sign(raw) * scale * np.sqrt(np.log1p((raw / scale) ** 2))
-
         edges = slowed(np.nan_to_num(reach), scale) * EDGE_WEIGHT
         motion = slowed(np.nan_to_num(flow), FLOW_SCALE) * MOTION_WEIGHT
         return np.concatenate([edges, motion], -1)
@@ -361,6 +357,11 @@ class LeastSquares:
         step[free] = -np.linalg.solve(matrix, gradient[free])
         length = np.abs(step).max(initial=0.0)
         return step * min(1.0, 3.0 / max(length, 1e-12))
+
+
+def slowed(raw: Float[np.ndarray, "*shape"], scale: float) -> Float[np.ndarray, "*shape"]:
+    """Residuals whose squares are Cauchy's loss: as they are below ``scale``, growing ever more slowly beyond."""
+    return np.sign(raw) * scale * np.sqrt(np.log1p((raw / scale) ** 2))
 
 
 def _of_objects(flow, columns: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray | None]:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from mjx_refine.scene import Shape
 from mjx_refine.view.outline import CORNERS, Arrays, Placed, corners, directions, larger, place, smaller, support_of
+from mjx_refine.view.rays import safe, slabs
 
 _Vector = tuple[Array, ...]
 
@@ -136,10 +137,6 @@ TANGENT = 1e-6
 """Square of the half chord of a ray that only touches, over the radius squared: its square root has a derivative."""
 
 
-def _safe(x: Array) -> Array:
-    return jnp.where(jnp.abs(x) < 1e-12, jnp.where(x < 0, -1e-12, 1e-12), x)
-
-
 def _sphere(o: _Vector, d: _Vector, size: _Vector) -> tuple[Array, Array]:
     dd = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
     along = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / dd
@@ -150,24 +147,19 @@ def _sphere(o: _Vector, d: _Vector, size: _Vector) -> tuple[Array, Array]:
 
 
 def _box(o: _Vector, d: _Vector, size: _Vector) -> tuple[Array, Array]:
-    nears, fars = [], []
-    for oi, di, si in zip(o, d, size, strict=True):
-        inverse = 1.0 / _safe(di)
-        middle, half = -oi * inverse, si * jnp.abs(inverse)
-        nears.append(middle - half)
-        fars.append(middle + half)
+    nears, fars = slabs(o, d, size)
     near, far = functools.reduce(larger, nears), functools.reduce(smaller, fars)
     return near, near < far
 
 
 def _cylinder(o: _Vector, d: _Vector, size: _Vector) -> tuple[Array, Array]:
     square = size[0] * size[0]
-    across = _safe(d[0] * d[0] + d[1] * d[1])
+    across = safe(d[0] * d[0] + d[1] * d[1])
     along = -(o[0] * d[0] + o[1] * d[1]) / across
     px, py = o[0] + along * d[0], o[1] + along * d[1]
     gap = square - (px * px + py * py)
     reach = jnp.sqrt(larger(gap, TANGENT * square + 1e-12) / across)
-    inverse = 1.0 / _safe(d[2])
+    inverse = 1.0 / safe(d[2])
     middle, width = -o[2] * inverse, size[1] * jnp.abs(inverse)
     near = larger(along - reach, middle - width)
     return near, (gap > 0.0) & (near < smaller(along + reach, middle + width))

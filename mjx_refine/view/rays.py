@@ -30,29 +30,36 @@ def _sphere(o: _Vector, d: _Vector, size: _Vector) -> Array:
     return jnp.where((gap > 0.0) & (t > 0.0), t, FAR)
 
 
-def _safe(x: Array) -> Array:
+def safe(x: Array) -> Array:
+    """``x``, kept off zero so that it can be divided by."""
     return jnp.where(jnp.abs(x) < 1e-12, jnp.where(x < 0, -1e-12, 1e-12), x)
 
 
-def _box(o: _Vector, d: _Vector, size: _Vector) -> Array:
+def slabs(o: _Vector, d: _Vector, size: _Vector) -> tuple[list[Array], list[Array]]:
+    """Where rays o + t d enter and leave each of the three slabs of a box (Kay & Kajiya, SIGGRAPH 1986)."""
     nears, fars = [], []
     for oi, di, si in zip(o, d, size, strict=True):
-        inverse = 1.0 / _safe(di)
+        inverse = 1.0 / safe(di)
         middle, half = -oi * inverse, si * jnp.abs(inverse)
         nears.append(middle - half)
         fars.append(middle + half)
+    return nears, fars
+
+
+def _box(o: _Vector, d: _Vector, size: _Vector) -> Array:
+    nears, fars = slabs(o, d, size)
     near, far = functools.reduce(jnp.maximum, nears), functools.reduce(jnp.minimum, fars)
     return jnp.where((near < far) & (near > 0.0), near, FAR)
 
 
 def _cylinder(o: _Vector, d: _Vector, size: _Vector) -> Array:
     radius, half = size[0], size[1]
-    across = _safe(d[0] * d[0] + d[1] * d[1])
+    across = safe(d[0] * d[0] + d[1] * d[1])
     along = -(o[0] * d[0] + o[1] * d[1]) / across
     px, py = o[0] + along * d[0], o[1] + along * d[1]
     gap = radius * radius - (px * px + py * py)
     reach = jnp.sqrt(jnp.maximum(gap, 0.0) / across)
-    inverse = 1.0 / _safe(d[2])
+    inverse = 1.0 / safe(d[2])
     middle, width = -o[2] * inverse, half * jnp.abs(inverse)
     near = jnp.maximum(along - reach, middle - width)
     far = jnp.minimum(along + reach, middle + width)

@@ -115,33 +115,32 @@ def test_a_column_counts_as_a_rollout(ours):
     assert ours.differences.spent - before[1] == pytest.approx(expected + 6 / FRAMES)
 
 
-def test_differences_step_in_and_it_is_said_once(ours, monkeypatch):
-    def broken(*_):
-        raise DerivativeError("the derivative in ball.radius is not finite from row 3 of 5 on")
-
-    monkeypatch.setattr(ours.automatic, "automatic", Automatic(ours.made, (told := []).append))
-    monkeypatch.setattr(ours.made, "_pushed", broken)
-    for _ in range(2):
-        one_sided, instead = ours.jacobians(5)
-        np.testing.assert_array_equal(instead, one_sided)
-    assert told == [
-        "differences instead of automatic derivatives: the derivative in ball.radius is not finite from row 3 of 5 on"
-    ]
-
-
-def test_what_does_not_compile_is_not_tried_again(ours, monkeypatch):
-    tried = []
+def broken_twice(ours, monkeypatch, error: Exception) -> tuple[list[str], int]:
+    """(what was said, how often it was tried) in two Jacobians without automatic derivatives, which are differences."""
+    told, tried = [], []
 
     def broken(*_):
         tried.append(1)
-        raise InputError("mujoco-mjx: its solver is not as in 3.17.0")
+        raise error
 
-    monkeypatch.setattr(ours.automatic, "automatic", Automatic(ours.made, (told := []).append))
+    monkeypatch.setattr(ours.automatic, "automatic", Automatic(ours.made, told.append))
     monkeypatch.setattr(ours.made, "_pushed", broken)
     for _ in range(2):
         one_sided, instead = ours.jacobians(5)
         np.testing.assert_array_equal(instead, one_sided)
-    assert len(tried) == len(told) == 1
+    return told, len(tried)
+
+
+def test_differences_step_in_and_it_is_said_once(ours, monkeypatch):
+    problem = "the derivative in ball.radius is not finite from row 3 of 5 on"
+    told, tried = broken_twice(ours, monkeypatch, DerivativeError(problem))
+    assert told == [f"differences instead of automatic derivatives: {problem}"]
+    assert tried == 2
+
+
+def test_what_does_not_compile_is_not_tried_again(ours, monkeypatch):
+    told, tried = broken_twice(ours, monkeypatch, InputError("mujoco-mjx: its solver is not as in 3.17.0"))
+    assert len(told) == tried == 1
 
 
 def test_kinks_are_left_to_differences(ours, monkeypatch):

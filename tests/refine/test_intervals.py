@@ -6,42 +6,27 @@ import dataclasses
 
 import numpy as np
 import pytest
+from own_clip import FLIGHT, SIZE, OwnClip, perturbed
 
 from mjx_refine import Options, refine
-from mjx_refine.batch import batch_from_scenes
 from mjx_refine.observation import Observation
-from mjx_refine.scene import Body, Camera, Scene
-from mjx_refine.search.features import flow_points, outlines
+from mjx_refine.search.features import flow_points
 from mjx_refine.search.intervals import intervals
-from mjx_refine.search.landing import LeastSquares
-from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.space import Space
-from mjx_refine.view.picture import draw
 
-SIZE, FRAMES = (320, 214), 16
-CAMERA = Camera((0.0, -3.0, 1.6), 65.0, 45.0)
-FLIGHT = Scene(
-    (Body("sphere", "ball", (0.2,), (-0.8, 0.3, 0.9), linear_velocity=(2.0, 0.4, 2.2)),), CAMERA, (0.0, 0.0, -9.81)
-)
+FRAMES = 16
 
 
-class Clip:
+class Clip(OwnClip):
     """A clip of ``FLIGHT`` with noise, and least squares on it from a start beside the truth."""
 
     def __init__(self, seed: int, noise: float = 0.5):
+        super().__init__(FLIGHT, FRAMES)
         generator = np.random.default_rng(seed)
-        simulator = MujocoSimulator(FLIGHT.shapes, 30.0, 1)
-        batch = batch_from_scenes([FLIGHT])
-        self.masks, flow = draw(simulator.rollout(batch, FRAMES)[0], batch, SIZE)
-        self.flow = flow + noise * generator.standard_normal(flow.shape)
-        around = Space.around(FLIGHT)
-        self.start = around.scene_at(
-            np.clip(around.start + 0.7 * around.sigma * generator.standard_normal(around.dimension), 0, 1)
-        )
-        self.space = Space.around(self.start)
-        seen = outlines(self.masks)
-        points = flow_points(self.masks, self.flow, seen.ids)
-        self.squares = LeastSquares(self.space, simulator.rollout, seen, (0,), SIZE, points)
+        self.flow = self.flow + noise * generator.standard_normal(self.flow.shape)
+        self.start = perturbed(FLIGHT, seed)
+        self.fit = self.squares(self.start, flow=flow_points(self.masks, self.flow, self.seen.ids))
+        self.space = self.fit.space
 
     def truth(self) -> np.ndarray:
         true = {p.name: p.start for p in Space.around(FLIGHT).parameters}
@@ -57,7 +42,7 @@ def known():
         near = clip.truth() + 0.05 * clip.space.sigma * np.random.default_rng(seed + 50).standard_normal(
             clip.space.dimension
         )
-        result.append((clip, intervals(clip.squares, np.clip(near, 0, 1), 4, seed)))
+        result.append((clip, intervals(clip.fit, np.clip(near, 0, 1), 4, seed)))
     return result
 
 
@@ -86,7 +71,7 @@ def test_more_noise_gives_wider_intervals():
     errors = []
     for noise in (0.3, 3.0):
         clip = Clip(3, noise)
-        told = intervals(clip.squares, clip.truth(), 3, 0)
+        told = intervals(clip.fit, clip.truth(), 3, 0)
         assert told.motion[0] == pytest.approx(noise * 480 / SIZE[0], rel=0.25)
         spin = [name.startswith("ball.spin") for name in clip.space.names]
         errors.append(told.standard_error[spin])
@@ -94,7 +79,7 @@ def test_more_noise_gives_wider_intervals():
 
 
 def test_the_same_seed_gives_the_same_intervals():
-    one, two = (intervals(clip.squares, clip.truth(), 2, 5) for clip in (Clip(1), Clip(1)))
+    one, two = (intervals(clip.fit, clip.truth(), 2, 5) for clip in (Clip(1), Clip(1)))
     np.testing.assert_array_equal(one.low, two.low)
     np.testing.assert_array_equal(one.covariance, two.covariance)
     assert one.free == two.free
@@ -102,9 +87,9 @@ def test_the_same_seed_gives_the_same_intervals():
 
 def test_an_unseen_object_determines_nothing():
     clip = Clip(2)
-    clip.squares.target[:] = np.nan
-    clip.squares.flow[:] = np.nan
-    told = intervals(clip.squares, clip.space.start, 2, 0)
+    clip.fit.target[:] = np.nan
+    clip.fit.flow[:] = np.nan
+    told = intervals(clip.fit, clip.space.start, 2, 0)
     assert not told.determined.any()
     np.testing.assert_allclose(told.standard_error, 1.0, rtol=0.05)
 

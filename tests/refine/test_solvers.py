@@ -6,60 +6,34 @@ import dataclasses
 
 import numpy as np
 import pytest
+from own_clip import SCENES, OwnClip, perturbed
 from scipy.optimize import lsq_linear
 
-from mjx_refine.batch import batch_from_scenes
 from mjx_refine.cli import commands
 from mjx_refine.errors import InputError
-from mjx_refine.observation import Observation
-from mjx_refine.scene import Body, Camera, Scene
-from mjx_refine.search.features import outlines
+from mjx_refine.scene import Scene
 from mjx_refine.search.landing import Landing, LeastSquares, Stage, stages
 from mjx_refine.search.options import SOLVERS, Options
 from mjx_refine.search.solvers import STEPS, StageProblem, improve
-from mjx_refine.sim.c import MujocoSimulator
-from mjx_refine.space import Space
-from mjx_refine.view.picture import draw
-from mjx_refine.view.tiles import TileScorer
 
 OTHERS = tuple(STEPS)
-SIZE, FRAMES = (320, 214), 12
-CAMERA = Camera((0.0, -3.0, 1.6), 65.0, 45.0)
-BALL = Body("sphere", "ball", (0.2,), (-0.8, 0.3, 0.9), linear_velocity=(2.0, 0.4, 2.2))
-CRATE = Body("box", "crate", (0.3, 0.2, 0.15), (-0.6, 0.1, 0.15), (0.966, 0.0, 0.0, 0.2588), (2.2, -0.2, 0.0),
-             friction=(0.3, 0.01), damping=-30.0)  # fmt: skip
-SCENES = {"flight": Scene((BALL,), CAMERA, (0.0, 0.0, -9.81)), "slide": Scene((CRATE,), CAMERA, (0.0, 0.0, -9.81))}
+FRAMES = 12
 
 every_solver = pytest.mark.parametrize("solver", OTHERS)
 
 
-class Clip:
+class Clip(OwnClip):
     """A clip of a scene, a start some prior widths away, and least squares from there."""
 
     def __init__(self, scene: Scene):
-        self.simulator = MujocoSimulator(scene.shapes, 30.0, 1)
-        batch = batch_from_scenes([scene])
-        masks, flow = draw(self.simulator.rollout(batch, FRAMES)[0], batch, SIZE)
-        self.seen = outlines(masks)
-        self.scorer = TileScorer(scene.shapes, Observation(flow, masks, 30.0), (1,))
-        space = Space.around(scene)
-        step = 0.7 * space.sigma * np.random.default_rng(2).normal(size=space.dimension)
-        self.start = space.scene_at(np.clip(space.start + step, 0, 1))
-        self.rollouts = 0.0
-
-    def rollout(self, batch, frames: int) -> np.ndarray:
-        self.rollouts += len(batch) * frames / FRAMES
-        return self.simulator.rollout(batch, frames)
+        super().__init__(scene, FRAMES)
+        self.start = perturbed(scene, 2)
 
     def land(self, solver: str, schedule: list[Stage] | None = None, **options) -> tuple[LeastSquares, Landing]:
         self.rollouts = 0.0
-        space = Space.around(self.start)
-        squares = LeastSquares(space, self.rollout, self.seen, (0,), SIZE, solver=solver, **options)
-        return squares, squares.run(space.start, stages(FRAMES) if schedule is None else schedule, hops=1)
-
-    def iou(self, scene: Scene) -> float:
-        batch = batch_from_scenes([scene])
-        return float(self.scorer(self.simulator.rollout(batch, FRAMES), batch).iou[0])
+        squares = self.squares(self.start, solver=solver, **options)
+        schedule = stages(FRAMES) if schedule is None else schedule
+        return squares, squares.run(squares.space.start, schedule, hops=1)
 
 
 @pytest.fixture(scope="module", params=SCENES, ids=SCENES)
