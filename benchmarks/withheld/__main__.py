@@ -9,8 +9,12 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import click
+import cv2
 
+from benchmarks.withheld import answer as answers_
 from benchmarks.withheld import exam, plan
+from benchmarks.withheld import score as scores
+from benchmarks.withheld import sheet as sheets
 from mjx_refine.files import write_text
 
 COUNTS = {"one": 36, "two": 12, "none": 14, "withheld": 8, "strange": 8}
@@ -51,6 +55,48 @@ def make(seed: int, out: Path, only: str, jobs: int, **counts: int) -> None:
     }
     (out / "key").mkdir(exist_ok=True)
     write_text(out / "key" / "exam.json", json.dumps(summary, indent=1) + "\n")
+
+
+@main.command()
+@click.argument("folder", metavar="EXAM", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the answers.")
+@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True)
+def answer(folder: Path, out: Path, jobs: int) -> None:
+    """Diagnoses every clip that has no answer yet."""
+    failed = 0
+    for result in answers_.answer(folder, out, jobs):
+        failed += result["status"] != 0
+        click.echo(f"{result['clip']}: exit {result['status']}, {result['seconds']} s, {result['peak_mb']} MB")
+    if failed:
+        raise click.ClickException(f"{failed} diagnoses failed; see log.txt in their folders, and call again")
+
+
+@main.command()
+@click.argument("folder", metavar="EXAM", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("answers", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--out", type=click.Path(path_type=Path), default=None, help="Also write the tables to this file.")
+def score(folder: Path, answers: Path, out: Path | None) -> None:
+    """Prints the results; refuses until every clip has its answer."""
+    try:
+        text = scores.report(scores.marks(folder, answers))
+    except ValueError as error:
+        raise click.ClickException(str(error)) from error
+    click.echo(text)
+    if out is not None:
+        write_text(out, text)
+
+
+@main.command()
+@click.argument("folder", metavar="EXAM", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="A PNG.")
+@click.option("--first", type=click.IntRange(0), default=0, show_default=True)
+@click.option("--count", type=click.IntRange(1), default=12, show_default=True)
+def sheet(folder: Path, out: Path, first: int, count: int) -> None:
+    """Draws a contact sheet, titled from the key, for a look by eye."""
+    numbers = [path.name for path in answers_.clips(folder)][first : first + count]
+    if not numbers:
+        raise click.UsageError(f"--first {first}: the exam has fewer clips")
+    cv2.imwrite(str(out), sheets.sheet(folder, numbers))
 
 
 if __name__ == "__main__":

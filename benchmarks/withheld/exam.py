@@ -118,6 +118,10 @@ def _acts(take: Take, index: int) -> bool:
         return span[0] >= 3 and span[0] <= FRAMES - 5
     if effect.name in ("friction_patch", "occluder"):
         return span[1] - span[0] >= 3
+    if effect.name == "mask_bias":  # something of a thinned mask must be left
+        reach = take.film.outlines
+        width = effect.parameters["width"]
+        return width > 0 or float((reach + np.roll(reach, 8, -1)).min()) > -4 * width
     if effect.name in ("camera_roll", "lens_distortion"):  # a still background does not tell of them; objects must
         return solve.displacement(take.stage, effect, "objects") > 1.5
     return True

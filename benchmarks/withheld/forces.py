@@ -10,6 +10,7 @@ import pybullet
 from jaxtyping import Float
 
 from benchmarks.withheld.effect import Effect, named
+from benchmarks.withheld.track import RATE
 
 AIR = 1.2  # kg/m^3
 SHAPE_DRAG = {"sphere": 0.47, "box": 1.05, "cylinder": 0.8}
@@ -123,7 +124,7 @@ def size(effects: tuple[Effect, ...], index: int, time: float) -> float:
 def jump(effects: tuple[Effect, ...], index: int, time: float, state: State, body: int, client: int) -> State:
     """Sets an object elsewhere in the step in which it jumps."""
     effect = named(effects, "teleport")
-    if effect is None or effect.target != index or int(round((effect.parameters["time"] - time) * 480)) != 0:
+    if effect is None or effect.target != index or round((effect.parameters["time"] - time) * RATE) != 0:
         return state
     place = state.position + _xyz(effect.parameters)
     turn = np.roll(state.quaternion, -1).tolist()
