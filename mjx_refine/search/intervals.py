@@ -20,21 +20,16 @@ from jaxtyping import Bool, Float
 from scipy import stats
 
 from mjx_refine.search.landing import LeastSquares, slowed
+from mjx_refine.search.noise import DRAWS, TREMBLE, measured, unmeasured
 from mjx_refine.space import Space
 
 CONFIDENCE = 0.90
 
-INFLATION = 2.6
+INFLATION = 1.2
 """Factor on the standard errors, calibrated on generated clips (``benchmarks.parameters``) that no table reports."""
 
 DETERMINED = 0.3
 """Standard error, in prior widths, below which the clip is said to determine a parameter."""
-
-EDGE_FLOOR = 0.15
-"""Least standard deviation of an outline's distance [px at a picture 480 wide]: masks are drawn on a grid."""
-
-MOTION_FLOOR = 0.2
-"""The same of flow: more than a simulation without noise would need, but contacts are not right to less."""
 
 CAUCHY = 2.5
 """Residuals beyond this many standard deviations count less (Cauchy's loss)."""
@@ -123,23 +118,25 @@ class _Posterior:
     def __init__(self, squares: LeastSquares):
         self.squares, self.space = squares, squares.space
         self.frames = len(squares.target)
-        objects = squares.target.shape[1]
-        self.edge, self.motion = np.ones(objects), np.full(objects, 0.5)
+        objects, directions = squares.target.shape[1:]
+        self.points = 0 if squares.flow is None else squares.flow.shape[2]
+        self.noise = unmeasured(self.frames, objects, directions, self.points)
 
     def measure_noise(self, point: np.ndarray) -> None:
-        """Robust standard deviations of the residuals at ``point``, by object."""
+        """What the residuals at ``point`` scatter by, and simulations that start next to it."""
         reach, flow, _ = self.squares.distances(point[None], self.frames)
-        objects = range(len(self.edge))
-        self.edge = np.array([_deviation(reach[0][:, n], EDGE_FLOOR) for n in objects])
-        self.motion = np.array([_deviation(flow[0][:, n], MOTION_FLOOR) for n in objects])
+        self.noise = measured(reach[0], flow[0], self.squares.pixels / self.squares.pixel)
+        draws = np.random.default_rng(0).standard_normal((DRAWS, len(point))) * TREMBLE * self.space.sigma
+        self.noise = self.noise.with_scatter(self._standardised(np.clip(point + draws, 0.0, 1.0))[0])
+
+    def _standardised(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        reach, flow, bad = self.squares.distances(points, self.frames)
+        return slowed(self.noise.standardised(reach, flow).reshape(len(points), -1), CAUCHY), bad
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(robust residuals (B, R), costs (B,))."""
-        reach, flow, bad = self.squares.distances(points, self.frames)
-        raw = np.concatenate(
-            [np.nan_to_num(reach) / self.edge[:, None], np.nan_to_num(flow) / self.motion[:, None]], -1
-        ).reshape(len(points), -1)
-        robust = slowed(raw, CAUCHY)
+        robust, bad = self._standardised(points)
+        robust = self.noise.settled(robust)
         prior = (points - self.space.start) / self.space.sigma
         cost = 0.5 * (robust**2).sum(-1) + 0.5 * (prior**2).sum(-1)
         return robust, np.where(bad, np.inf, cost)
@@ -231,11 +228,6 @@ def _no_wider_than_prior(covariance: np.ndarray) -> np.ndarray:
     return (directions * np.clip(variances, 0.0, 1.0)) @ directions.T
 
 
-def _deviation(values: np.ndarray, floor: float) -> float:
-    seen = values[np.isfinite(values)]
-    return max(1.4826 * float(np.median(np.abs(seen))), floor) if len(seen) else 1.0
-
-
 def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refits: int, seed: int) -> Intervals:
     """Refits around ``point`` and what their curvatures and scatter say about each parameter.
 
@@ -285,8 +277,8 @@ def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refi
         determined=(error < DETERMINED) & ~edge,
         on_bound=edge,
         free=_free(space, covariance),
-        edge=posterior.edge,
-        motion=posterior.motion,
+        edge=posterior.noise.told[0],
+        motion=posterior.noise.told[1],
         evaluations=squares.evaluations - before,
     )
 
