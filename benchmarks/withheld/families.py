@@ -260,8 +260,8 @@ def _growing(rng: np.random.Generator, stage: Stage) -> Rule:
 
 
 def _flip(rng: np.random.Generator, stage: Stage) -> Rule:
-    time = float(rng.uniform(0.25, 0.55))
-    return lambda s: Effect("gravity_flip", None, {"time": time, "share": s})
+    share = float(rng.choice([1.0, 2.0]))  # gone, or turned over
+    return lambda s: Effect("gravity_flip", None, {"time": SECONDS * (1 - s), "share": share})
 
 
 def _vortex(rng: np.random.Generator, stage: Stage) -> Rule:
@@ -286,7 +286,7 @@ STRANGE: dict[str, Family] = {
     "spring": Family(("flight", "slide", "roll"), (0.3, 40.0), _spring, pixels=(8.0, 40.0)),
     "periodic_force": Family(("flight", "slide", "roll"), (0.5, 60.0), _periodic, pixels=(5.0, 40.0)),
     "growing_force": Family(("flight", "slide", "roll"), (0.5, 60.0), _growing, (8.0, 40.0), accepts=("wind",)),
-    "gravity_flip": Family(("flight", "bounce"), (0.05, 2.0), _flip, pixels=(10.0, 40.0)),
+    "gravity_flip": Family(("flight", "bounce"), (0.05, 0.7), _flip, pixels=(10.0, 40.0)),
     "vortex": Family(("flight", "slide", "roll"), (0.1, 30.0), _vortex, pixels=(8.0, 40.0)),
     "shrinking": Family(("flight", "slide", "roll"), (0.05, 2.0), _shrinking, (5.0, 20.0), accepts=("shape",)),
     "teleport": Family(("flight", "slide", "roll"), (0.01, 0.6), _teleport, pixels=(6.0, 40.0)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -122,7 +123,7 @@ def _near(name: str, said: tuple[str, ...], candidates: list[str], groups: list[
     return name in said[:2] or name in candidates[:2] or declared
 
 
-def overlap(a: list[int] | tuple[int, int], b: list[int] | tuple[int, int]) -> float:
+def overlap(a: Sequence[int], b: Sequence[int]) -> float:
     """Intersection over union of two windows of frames, both ends counted in."""
     both = min(a[1], b[1]) - max(a[0], b[0]) + 1
     return max(both, 0) / ((a[1] - a[0] + 1) + (b[1] - b[0] + 1) - max(both, 0))

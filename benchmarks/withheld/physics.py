@@ -148,7 +148,7 @@ class _Stage:
         """What the forces on object i depend on."""
         place, turn = pybullet.getBasePositionAndOrientation(self.ids[i], physicsClientId=self.client)
         velocity, spin = pybullet.getBaseVelocity(self.ids[i], physicsClientId=self.client)
-        return forces.State(np.array(place), np.roll(turn, 1), np.array(velocity), np.array(spin))
+        return forces.State(np.array(place), np.array([turn[3], *turn[:3]]), np.array(velocity), np.array(spin))
 
     def contacts(self, acting: np.ndarray) -> None:
         """Notes who met whom, and the hidden face."""
@@ -211,7 +211,7 @@ def simulate(entries: list[Entry], effects: tuple[Effect, ...], seconds: float) 
             for i, body in enumerate(stage.ids):
                 state = stage.state(i)
                 state = forces.jump(effects, i, time, state, body, client)
-                position[step, i] = state.position - rotation.matrix(state.quaternion) @ stage.centre[i]
+                position[step, i] = state.position
                 turn[step, i], speed[step, i] = state.quaternion, np.linalg.norm(state.velocity)
                 scale[step, i] = forces.size(effects, i, time)
                 patch = stage.friction(i, state)
@@ -225,4 +225,7 @@ def simulate(entries: list[Entry], effects: tuple[Effect, ...], seconds: float) 
                         )
             pybullet.stepSimulation(physicsClientId=client)
             stage.contacts(acting[:, step])
+        for i, centre in enumerate(stage.centre):
+            if centre.any():  # from the centre of mass to the geometric one
+                position[:, i] -= rotation.matrix(turn[:, i]) @ centre
         return Track(position, continuous(turn), scale, speed, stage.touched, gap, acting, stage.hit)
