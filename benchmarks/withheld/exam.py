@@ -116,9 +116,9 @@ def _acts(take: Take, index: int) -> bool:
     if span is None:
         return False
     if effect.name in ("push", "hidden_obstacle"):
-        return span[0] >= 3 and span[0] <= FRAMES - 5
-    if effect.name in ("friction_patch", "occluder"):
-        return span[1] - span[0] >= 3
+        return 3 <= span[0] <= FRAMES - 7
+    if effect.name in ("friction_patch", "occluder"):  # it must come or go while there is something to see
+        return span[1] - span[0] >= 3 and (span[0] >= 4 or span[1] <= FRAMES - 6)
     if effect.name == "mask_bias":  # something of a thinned mask must be left
         reach = take.film.outlines
         width = effect.parameters["width"]

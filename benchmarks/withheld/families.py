@@ -122,7 +122,7 @@ def _obstacle(rng: np.random.Generator, stage: Stage) -> Rule:
 
     post = bool(rng.random() < 0.5)
     form, radius = ("post", float(rng.uniform(0.05, 0.15))) if post else ("box", float(rng.uniform(0.05, 0.1)))
-    breadth, aside = float(rng.uniform(0.3, 0.8)), float(np.radians(rng.uniform(-30, 30)))
+    breadth, aside = float(rng.uniform(0.3, 0.8)), float(np.radians(rng.uniform(-55, 55)))
     points = solids.of(stage.objects[0]).points
 
     def rule(s: float) -> Effect | None:

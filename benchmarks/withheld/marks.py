@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from benchmarks.withheld.stage import FRAMES
+
 VECTORS: dict[str, dict[str, tuple[str, ...]]] = {
     # Shares of the true magnitude.
     "magnus": {"coefficient": ("coefficient",)},
@@ -137,7 +139,7 @@ def _place(key: dict[str, Any], where: list[dict[str, Any]]) -> tuple[bool | Non
         return False, False, False
     top = where[0]
     first, last = effect["acts"]
-    end = 29
+    end = FRAMES - 1
     acts = (max(first - SLACK, 0), min(last + SLACK, end))
     right = effect["object"] is None or top["object"] == effect["object"]
     frames = tuple(int(v) for v in top["frames"])
