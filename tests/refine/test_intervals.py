@@ -107,3 +107,16 @@ def test_results_carry_intervals_around_their_values():
     assert without.known is None
     assert all(row.low is None for row in without.parameters)
     assert result.refined.scores.fitness[0] >= without.refined.scores.fitness[0] - 1e-9
+
+
+def test_what_is_not_fitted_widens_errors():
+    clip = Clip(5)
+    truth = clip.truth()
+    fitted = intervals(clip.fit, truth, 2, 0)
+    np.testing.assert_array_equal(fitted.misfit, [1.0])
+    # Outlines of another motion, which no throw of this ball explains: up and down, ten times a second.
+    clip.fit.target += np.where(np.arange(FRAMES) % 3 == 0, 6.0, -3.0)[:, None, None]
+    lost = intervals(clip.fit, truth, 2, 0)
+    assert lost.misfit[0] > 3
+    assert (lost.standard_error[fitted.determined] > 1.5 * fitted.standard_error[fitted.determined]).all()
+    assert lost.determined.sum() < fitted.determined.sum()
