@@ -39,7 +39,8 @@ from mjx_refine.search.objective import Objective
 from mjx_refine.search.problem import Problem, Start
 from mjx_refine.search.progress import Progress
 from mjx_refine.search.run import Run
-from mjx_refine.space import Space, rotations
+from mjx_refine import rotations
+from mjx_refine.space import Space
 
 METHODS = ("hybrid", "cmaes", "gradient", "pycma", "oracle")
 OURS = ("hybrid", "cmaes", "gradient")

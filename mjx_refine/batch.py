@@ -11,6 +11,21 @@ from mjx_refine.scene import Body, Camera, Scene, Shape
 
 
 @dataclasses.dataclass(frozen=True)
+class BatchEffect:
+    """One effect of every candidate.
+
+    Attributes:
+      name: of its kind.
+      target: index of the object that it acts on, or -1.
+      values: its parameters, in the kind's order and units.
+    """
+
+    name: str
+    target: int
+    values: Float[np.ndarray, "batch parameters"]
+
+
+@dataclasses.dataclass(frozen=True)
 class SceneBatch:
     """B candidates of one scene kind with N objects, float64.
 
@@ -29,6 +44,7 @@ class SceneBatch:
       camera_position: [m].
       camera_pitch: rotation about the world's x axis, 0 looks straight down [rad].
       camera_fovy: vertical field of view [rad].
+      effects: what the base model lacks, the same kinds for every candidate.
     """
 
     shapes: tuple[Shape, ...]
@@ -45,6 +61,7 @@ class SceneBatch:
     camera_position: Float[np.ndarray, "batch 3"]
     camera_pitch: Float[np.ndarray, "batch"]
     camera_fovy: Float[np.ndarray, "batch"]
+    effects: tuple[BatchEffect, ...] = ()
 
     def __len__(self) -> int:
         return len(self.mass)
@@ -55,21 +72,30 @@ class SceneBatch:
 
     def map(self, function) -> SceneBatch:
         """Applies ``function`` to every array."""
-        changed = {f.name: function(getattr(self, f.name)) for f in dataclasses.fields(self) if f.name != "shapes"}
-        return dataclasses.replace(self, **changed)
+        changed = {name: function(getattr(self, name)) for name in ARRAYS}
+        effects = tuple(dataclasses.replace(e, values=function(e.values)) for e in self.effects)
+        return dataclasses.replace(self, effects=effects, **changed)
+
+
+ARRAYS = tuple(f.name for f in dataclasses.fields(SceneBatch) if f.name not in ("shapes", "effects"))
+"""The fields that hold one row a candidate."""
 
 
 def concatenate(batches: list[SceneBatch]) -> SceneBatch:
-    """One batch of all candidates; the shapes must be equal.
+    """One batch of all candidates; shapes and kinds of effects must be equal.
 
     Raises:
       ValueError: no batch, or the scene kinds differ.
     """
-    if not batches or any(batch.shapes != batches[0].shapes for batch in batches):
-        raise ValueError(f"scene kinds {[b.shapes for b in batches]}; expected at least one, all with the same shapes")
-    names = [f.name for f in dataclasses.fields(SceneBatch) if f.name != "shapes"]
-    arrays = {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in names}
-    return SceneBatch(batches[0].shapes, **arrays)
+    kinds = [(b.shapes, [(e.name, e.target) for e in b.effects]) for b in batches]
+    if not batches or any(kind != kinds[0] for kind in kinds):
+        raise ValueError(f"scene kinds {kinds}; expected at least one, all with the same shapes and effects")
+    arrays = {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in ARRAYS}
+    effects = tuple(
+        dataclasses.replace(e, values=np.concatenate([b.effects[k].values for b in batches]))
+        for k, e in enumerate(batches[0].effects)
+    )
+    return SceneBatch(batches[0].shapes, **arrays, effects=effects)
 
 
 def geom_size(body: Body) -> tuple[float, float, float]:
@@ -82,7 +108,7 @@ def geom_size(body: Body) -> tuple[float, float, float]:
 
 
 def batch_from_scenes(scenes: list[Scene]) -> SceneBatch:
-    """Scenes of one kind as a batch.
+    """Scenes of one kind as a batch, without their effects (``effects.batch_with_effects`` has them).
 
     Raises:
       ValueError: no scene, or the scenes' kinds differ.

@@ -14,7 +14,7 @@ from mjx_refine.guess.motion import Motion, motions, restitution
 from mjx_refine.guess.scaling import scaled
 from mjx_refine.guess.tracks import Track
 from mjx_refine.scene import Body, Scene
-from mjx_refine.space import rotations
+from mjx_refine import rotations
 
 GRAVITY = 9.81
 BODY_SIZE = 0.15

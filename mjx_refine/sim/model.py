@@ -122,8 +122,16 @@ def uniform_inertia(batch: SceneBatch) -> Float[np.ndarray, "batch objects 3"]:
     return np.stack(columns, 1)
 
 
-def apply_fields(model: mujoco.MjModel, fields: ModelFields, row: int) -> None:
-    """Writes candidate ``row`` into ``model`` in place, as the compiler would have."""
+def apply_fields(
+    model: mujoco.MjModel, fields: ModelFields, row: int, centre_of_mass: Float[np.ndarray, "objects 3"] | None = None
+) -> None:
+    """Writes candidate ``row`` into ``model`` in place, as the compiler would have.
+
+    ``centre_of_mass`` is in the bodies' frames [m]; the moments of inertia about it stay those of the uniform body.
+    """
+    model.body_ipos[1:] = 0.0 if centre_of_mass is None else centre_of_mass
+    same = mujoco.mjtSameFrame.mjSAMEFRAME_BODY if centre_of_mass is None else mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT
+    model.body_sameframe[1:] = same
     model.geom_size[1:] = fields.geom_size[row]
     model.geom_rbound[1:] = fields.geom_rbound[row]
     model.geom_aabb[1:, 3:] = _half_extents(model, fields.geom_size[row])

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from mjx_refine.scene import Body, Scene
-from mjx_refine.space import rotations
+from mjx_refine import rotations
 from mjx_refine.space.parameter import Parameter
 
 _AXES = ("x", "y", "z")

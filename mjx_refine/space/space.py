@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from mjx_refine.batch import SceneBatch, batch_from_scenes, scene_from_batch
 from mjx_refine.scene import Scene
-from mjx_refine.space import rotations
+from mjx_refine import rotations
 from mjx_refine.space.layout import body_parameters, is_upright, lowest_extent, world_parameters
 from mjx_refine.space.parameter import Parameter
 

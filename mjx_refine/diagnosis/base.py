@@ -1,0 +1,88 @@
+"""The base model's refit: what ordinary parameters explain is no gap."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from mjx_refine import rotations
+from mjx_refine.batch import batch_from_scenes
+from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.observation import Observation
+from mjx_refine.scene import Body, Scene
+from mjx_refine.search.features import flow_points, outlines
+from mjx_refine.search.landing import LeastSquares, stages
+from mjx_refine.space import Space
+from mjx_refine.space.layout import lowest_extent
+from mjx_refine.view.tiles import foreground
+
+RESTING = ("clearance", "tilt")
+
+TRUST = 0.2
+"""Width of the prior around the given scene, in errors of a language model: the scene is thought to be refined. Its tails
+are heavy (``fit.TAIL``), so that a rough scene may move."""
+
+GOOD = 2.5
+"""Mean square residual below which no further start is tried."""
+
+
+def base_space(scene: Scene) -> Space:
+    """The parameters of the base model, with bodies that lie flat on the floor kept there.
+
+    A body at rest on the floor has no lift, tilt, vertical speed or spin about horizontal axes; least squares would use
+    them to explain other things.
+    """
+    space = Space.around(scene)
+    flat = [_lies_flat(scene, i, body) for i, body in enumerate(scene.objects)]
+    held = np.array(
+        [
+            p.index[0] >= 0
+            and flat[p.index[0]]
+            and (
+                p.field in RESTING
+                or (p.field == "linear_velocity" and p.index[1] == 2)
+                or (p.field == "spin" and p.index[1] < 2)
+            )
+            for p in space.parameters
+        ],
+        bool,
+    )
+    space = space.freeze(held, space.start, "it lies on the floor") if held.any() else space
+    return dataclasses.replace(
+        space, parameters=tuple(dataclasses.replace(p, width=TRUST * p.width) for p in space.parameters)
+    )
+
+
+def _lies_flat(scene: Scene, i: int, body: Body) -> bool:
+    if body.shape == "sphere":
+        return False
+    batch = batch_from_scenes([scene])
+    gap = body.position[2] - float(lowest_extent(body.shape, batch.size[0, i], batch.quaternion[0, i]))
+    up = np.abs(rotations.matrix(np.array(body.orientation))[2])
+    level = (up.max() if body.shape == "box" else up[2]) > math.cos(math.radians(1.5))
+    spin = rotations.rotate(np.array(body.orientation), np.array(body.angular_velocity))
+    return level and abs(gap) < 0.01 and abs(body.linear_velocity[2]) < 0.1 and float(np.abs(spin[:2]).max()) < 0.5
+
+
+def fit_base(clip: ClipFit, space: Space, observation: Observation, masks_of: tuple[int, ...]) -> Fit:
+    """The base model's fit: landed frame by frame as a refinement is, from the scene as it is given and with hops."""
+    hypothesis = Hypothesis(space)
+    masks = foreground(observation)
+    seen = outlines(masks)
+    columns = tuple(seen.ids.index(i) if i in seen.ids else -1 for i in masks_of)
+    flow = flow_points(masks, observation.flow, seen.ids)
+    fits: list[Fit] = [clip.fit(hypothesis, np.zeros(space.dimension), 10)]
+    wide = dataclasses.replace(
+        space, parameters=tuple(dataclasses.replace(p, width=p.width / TRUST) for p in space.parameters)
+    )
+    for hops in (0, 2):
+        landing = LeastSquares(wide, clip.rollout, seen, columns, observation.size, flow)
+        point = landing.run(space.start, stages(observation.length), hops).point
+        fits.append(clip.fit(hypothesis, (point - space.start) / space.sigma, 12))
+        if clip.misfit(min(fits, key=lambda fit: fit.cost)) < GOOD:
+            break
+    return min(fits, key=lambda fit: fit.cost)
+

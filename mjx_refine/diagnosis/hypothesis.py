@@ -1,0 +1,134 @@
+"""A hypothesis: the base model's parameters and the effects at work, as one vector with a standard normal prior."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mjx_refine.batch import BatchEffect, SceneBatch, scene_from_batch
+from mjx_refine.effects import EffectKind, effect_entry, kind_of
+from mjx_refine.effects.acting import on_the_floor
+from mjx_refine.scene import Effect, Scene
+from mjx_refine.space import Space
+
+
+@dataclasses.dataclass(frozen=True)
+class Term:
+    """One effect in a hypothesis, with the prior of its numbers.
+
+    Attributes:
+      name: of its kind.
+      target: index of the object, or -1.
+      centre: prior mean.
+      width: prior standard deviation.
+      low: lower bounds.
+      high: upper bounds.
+      free: which numbers are fitted; the others stay at ``centre``.
+      places: how many places or moments were looked through for this one; its logarithm is paid as evidence.
+    """
+
+    name: str
+    target: int
+    centre: Float[np.ndarray, "parameters"]
+    width: Float[np.ndarray, "parameters"]
+    low: Float[np.ndarray, "parameters"]
+    high: Float[np.ndarray, "parameters"]
+    free: Bool[np.ndarray, "parameters"]
+    places: int = 1
+
+    @property
+    def kind(self) -> EffectKind:
+        return kind_of(self.name)
+
+
+def term(name: str, target: int, frames: int, start: np.ndarray | None = None, **changes) -> Term:
+    """A term around its kind's prior, or around ``start`` where that is given."""
+    kind = kind_of(name)
+    rows = kind.spread(frames)
+    centre = np.array([p.centre for p in rows]) if start is None else np.asarray(start, np.float64)
+    one = Term(
+        name,
+        target,
+        centre,
+        np.array([p.width for p in rows]),
+        np.array([p.low for p in rows]),
+        np.array([p.high for p in rows]),
+        np.array([not p.whole for p in rows]),
+    )
+    return dataclasses.replace(one, **changes)
+
+
+@dataclasses.dataclass(frozen=True)
+class Hypothesis:
+    """Base parameters and terms; the vector z is their distance from the prior's mean in prior widths.
+
+    Attributes:
+      space: the base model's parameters.
+      terms: the effects at work.
+    """
+
+    space: Space
+    terms: tuple[Term, ...] = ()
+
+    @property
+    def dimension(self) -> int:
+        return self.space.dimension + sum(int(t.free.sum()) for t in self.terms)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of z."""
+        lows = [-self.space.start / self.space.sigma]
+        highs = [(1.0 - self.space.start) / self.space.sigma]
+        for t in self.terms:
+            lows.append(((t.low - t.centre) / t.width)[t.free])
+            highs.append(((t.high - t.centre) / t.width)[t.free])
+        return np.concatenate(lows), np.concatenate(highs)
+
+    @property
+    def ordinary(self) -> Bool[np.ndarray, "dimension"]:
+        """Which coordinates are the base model's."""
+        return np.arange(self.dimension) < self.space.dimension
+
+    @property
+    def moves(self) -> Bool[np.ndarray, "dimension"]:
+        """Which coordinates change the rollout, and not just how it is seen."""
+        parts = [np.array([not p.field.startswith("camera") for p in self.space.parameters], bool)]
+        for t in self.terms:
+            acts = t.kind.physical or type(t.kind).frame_times is not EffectKind.frame_times
+            parts.append(np.full(int(t.free.sum()), acts))
+        return np.concatenate(parts)
+
+    def values(self, z: Float[np.ndarray, "batch dimension"], k: int) -> Float[np.ndarray, "batch parameters"]:
+        """The numbers of term ``k``."""
+        start = self.space.dimension + sum(int(t.free.sum()) for t in self.terms[:k])
+        t = self.terms[k]
+        result = np.repeat(t.centre[None], len(z), 0)
+        part = z[:, start : start + int(t.free.sum())]
+        result[:, t.free] = np.clip(t.centre[t.free] + part * t.width[t.free], t.low[t.free], t.high[t.free])
+        return result
+
+    def batch(self, z: Float[np.ndarray, "batch dimension"]) -> SceneBatch:
+        """The candidates at ``z``."""
+        effects = tuple(BatchEffect(t.name, t.target, self.values(z, k)) for k, t in enumerate(self.terms))
+        return self.batch_with(z, effects)
+
+    def batch_with(self, z: Float[np.ndarray, "batch dimension"], effects: tuple[BatchEffect, ...]) -> SceneBatch:
+        """The candidates at ``z`` with other effects than the terms'; a tilted floor carries its objects along."""
+        u = np.clip(self.space.start + z[:, : self.space.dimension] * self.space.sigma, 0.0, 1.0)
+        return on_the_floor(dataclasses.replace(self.space.decode(u), effects=effects))
+
+    def scene(self, z: Float[np.ndarray, "dimension"], frames: int) -> Scene:
+        """The scene at ``z``, with its effects as entries."""
+        batch = self.batch(z[None])
+        names = self.space.scene.names
+        entries: list[Effect] = []
+        for k, t in enumerate(self.terms):
+            target = names[t.target] if t.target >= 0 else None
+            entries.append(effect_entry(t.kind, target, self.values(z[None], k)[0], frames))
+        return dataclasses.replace(scene_from_batch(batch, 0, self.space.scene), effects=tuple(entries))
+
+    def added(self, extra: Term) -> Hypothesis:
+        """The hypothesis with one more effect."""
+        return dataclasses.replace(self, terms=(*self.terms, extra))

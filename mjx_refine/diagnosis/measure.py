@@ -1,0 +1,148 @@
+"""What a diagnosis sees of a clip, and how noisy it is."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import ndimage
+
+from mjx_refine.observation import Observation
+from mjx_refine.search.features import flow_points, outlines
+from mjx_refine.view.tiles import foreground
+
+GRID = (6, 4)
+"""Columns and rows of places beside the objects where the flow is looked at."""
+
+EDGE_FLOOR, FLOW_FLOOR = 0.3, 0.15
+"""Noise that is assumed at least [px]: masks are drawn in whole pixels, and no flow is better."""
+
+FLOW_PART = 0.05
+"""Error of measured flow that is smooth over an object, as a part of its motion."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """Of one clip with N objects.
+
+    Attributes:
+      reach: how far each object's mask reaches [px]; NaN where that is not known.
+      pixels: points of each mask.
+      flow: the flow there [px/frame]; NaN where it was not measured.
+      places: points of a grid over the picture [px].
+      background: flow there [px/frame], NaN on and near objects.
+      present: whether the object has a mask.
+      edge_noise: of ``reach``, by object [px].
+      flow_noise: of ``flow``, by object [px].
+      background_noise: of ``background`` [px].
+    """
+
+    reach: Float[np.ndarray, "frames objects directions"]
+    pixels: Float[np.ndarray, "frames objects points 2"]
+    flow: Float[np.ndarray, "intervals objects points 2"]
+    places: Float[np.ndarray, "places 2"]
+    background: Float[np.ndarray, "intervals places 2"]
+    present: np.ndarray
+    edge_noise: Float[np.ndarray, "objects"]
+    flow_noise: Float[np.ndarray, "objects"]
+    background_noise: float
+
+
+def measure(observation: Observation, columns: tuple[int, ...]) -> Measured:
+    """Measures a clip.
+
+    Args:
+      observation: the clip.
+      columns: for each object the position of its id among the masks' ids, or -1.
+    """
+    masks = foreground(observation)
+    seen = outlines(masks)
+    pixels, flow = flow_points(masks, observation.flow, seen.ids)
+    chosen, lost = [max(j, 0) for j in columns], np.array([j < 0 for j in columns])
+    reach = np.where(lost[None, :, None], np.nan, seen.support[:, chosen])
+    flow = np.where(lost[None, :, None, None], np.nan, flow[:-1, chosen])
+    reach = _without_contacts(masks, reach, [seen.ids[j] for j in chosen])
+    places, background = _beside(masks, observation.flow)
+    sigma = observation.flow_sigma
+    given = float(np.nanmedian(sigma)) if sigma is not None else 0.0
+    present = np.isfinite(seen.centre[:, chosen, 0]) & ~lost
+    return Measured(
+        reach=reach,
+        pixels=pixels[:, chosen],
+        flow=flow,
+        places=places,
+        background=background,
+        present=present,
+        edge_noise=np.maximum(_roughness(reach), EDGE_FLOOR),
+        flow_noise=_flow_noise(pixels[:-1, chosen], flow, given),
+        background_noise=max(1.5 * _spread(background), given / 3, 0.05),
+    )
+
+
+def _without_contacts(masks: np.ndarray, reach: np.ndarray, ids: list[int]) -> np.ndarray:
+    """Outlines without those that the picture's border or another mask cuts (``outlines`` has done so already)."""
+    return reach
+
+
+def _roughness(reach: Float[np.ndarray, "frames objects directions"]) -> Float[np.ndarray, "objects"]:
+    """Noise of the outlines from third differences in time, which no steady acceleration changes [px]."""
+    if len(reach) < 6:
+        return np.full(reach.shape[1], EDGE_FLOOR)
+    third = np.abs(np.diff(reach, 3, axis=0)) / np.sqrt(20.0)
+    return np.array([1.4826 * _median(third[:, n]) for n in range(reach.shape[1])])
+
+
+def _median(values: np.ndarray) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else 0.0
+
+
+def _incoherence(pixels: np.ndarray, flow: np.ndarray) -> Float[np.ndarray, "objects"]:
+    """Noise of the flow: what an affine motion inside a mask leaves of it [px]."""
+    result = np.zeros(flow.shape[1])
+    for n in range(flow.shape[1]):
+        left = []
+        for at, moved in zip(pixels[:, n], flow[:, n], strict=True):
+            if not np.isfinite(moved).all():
+                continue
+            design = np.concatenate([np.ones((len(at), 1)), at - at.mean(0)], 1)
+            fitted = np.linalg.lstsq(design, moved, rcond=None)[0]
+            left.append(np.abs(moved - design @ fitted) * np.sqrt(len(at) / (len(at) - 3)))
+        result[n] = 1.4826 * _median(np.array(left)) if left else 0.0
+    return result
+
+
+def _flow_noise(pixels: np.ndarray, flow: np.ndarray, given: float) -> Float[np.ndarray, "objects"]:
+    """Noise of the flow by object [px]: incoherence and, since flow errs smoothly too, a part of the motion itself."""
+    speed = np.linalg.norm(flow, axis=-1)
+    typical = np.array([_median(speed[:, n]) for n in range(flow.shape[1])])
+    incoherent = np.maximum(_incoherence(pixels, flow), max(given, FLOW_FLOOR))
+    return np.hypot(incoherent, FLOW_PART * typical)
+
+
+def _beside(masks: Int[np.ndarray, "frames height width"], flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places of a grid and the median flow around each, where no object is near."""
+    height, width = masks.shape[1:]
+    x = (np.arange(GRID[0]) + 0.5) * width / GRID[0]
+    y = (np.arange(GRID[1]) + 0.5) * height / GRID[1]
+    places = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    half = max(2, min(width, height) // 24)
+    result = np.full((len(flow), len(places), 2), np.nan)
+    for t in range(len(flow)):
+        near = ndimage.binary_dilation((masks[t] > 0) | (masks[t + 1] > 0), iterations=max(6, half))
+        for k, (cx, cy) in enumerate(places):
+            window = np.s_[max(int(cy) - half, 0) : int(cy) + half + 1, max(int(cx) - half, 0) : int(cx) + half + 1]
+            values = flow[t][window][~near[window]]
+            values = values[np.isfinite(values).all(-1)]
+            if len(values) > half * half:
+                result[t, k] = np.median(values, axis=0)
+    return places, result
+
+
+def _spread(background: np.ndarray) -> float:
+    """Noise of the background's flow: how far places are from the picture's common motion [px]."""
+    if not np.isfinite(background).any():
+        return 1.0
+    common = np.array([[_median(background[t, :, k]) for k in range(2)] for t in range(len(background))])
+    return 1.4826 * _median(np.abs(background - common[:, None]))

@@ -1,0 +1,151 @@
+"""What a batch of scenes predicts of a clip's measurements: reach of the masks, flow on the objects and beside them."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.effects import acting
+from mjx_refine.effects.kind import OutlineView
+from mjx_refine.scene import Shape
+from mjx_refine.search.features import DIRECTIONS
+from mjx_refine.view.outline import Arrays, directions, larger, place, support_of
+from mjx_refine.view.points import point_flow_function
+
+SIZES = (1, 4, 16, 32, 48, 64, 96, 128)
+"""Batch sizes that are compiled."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Prediction:
+    """Of B candidates.
+
+    Attributes:
+      reach: support functions of the silhouettes [px]; NaN where nothing is seen.
+      flow: at the measured points of the objects [px/frame].
+      background: flow at the measured points beside the objects [px/frame].
+      bad: candidates that diverged.
+    """
+
+    reach: Float[np.ndarray, "batch frames objects directions"]
+    flow: Float[np.ndarray, "batch intervals objects points 2"]
+    background: Float[np.ndarray, "batch intervals places 2"]
+    bad: np.ndarray
+
+
+def _outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]):
+    """(reach, contact x, contact y, facing, scale) of every silhouette in every direction."""
+    placed = place(shapes, arrays, image)
+    normals = jnp.asarray(directions(DIRECTIONS), placed.centre.dtype)
+    tangents = jnp.stack([-normals[:, 1], normals[:, 0]], -1)
+    reach, contact, facing, scale = [], [], [], []
+    for n, shape in enumerate(shapes):
+        h, slope = jax.jvp(lambda u, shape=shape, n=n: support_of(shape, placed, n, u), (normals,), (tangents,))
+        # A convex outline's contact point is the gradient of its support function (Schneider, 1.7).
+        point = h[..., None] * normals + slope[..., None] * tangents
+        lean = h / placed.focal
+        outward = jnp.concatenate([jnp.broadcast_to(normals, (*h.shape, 2)), -lean[..., None]], -1)
+        length = jnp.sqrt(1 + lean**2)
+        local = (placed.axes[:, :, n, None] * (outward / length[..., None])[..., :, None]).sum(-2)
+        reach.append(h)
+        contact.append(point + 0.5 * jnp.asarray(image, h.dtype))
+        facing.append(local)
+        scale.append(placed.focal * length / larger(placed.shown[:, :, n, 2], 0.05)[..., None])
+    middle = 0.5 * image[0] * normals[:, 0] + 0.5 * image[1] * normals[:, 1]
+    return jnp.stack(reach, 2) + middle, jnp.stack(contact, 2), jnp.stack(facing, 2), jnp.stack(scale, 2)
+
+
+def _plain_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]):
+    placed = place(shapes, arrays, image)
+    normals = jnp.asarray(directions(DIRECTIONS), placed.centre.dtype)
+    middle = 0.5 * image[0] * normals[:, 0] + 0.5 * image[1] * normals[:, 1]
+    return jnp.stack([support_of(shape, placed, n, normals) for n, shape in enumerate(shapes)], 2) + middle
+
+
+@functools.partial(jax.jit, static_argnums=(0, 3, 4))
+def _predict(shapes, arrays, pixels, image, drawn: bool):
+    told = _outline_function(shapes, arrays, image) if drawn else (_plain_function(shapes, arrays, image),)
+    return told, point_flow_function(shapes, arrays, pixels, image)
+
+
+class Predictor:
+    """Predictions for one clip.
+
+    Args:
+      shapes: the scene kind.
+      pixels: points of each object at which the flow was measured [px]; the last frame's are not used.
+      places: points beside the objects at which the flow was measured [px].
+      image: (width, height) [px].
+      fps: frames a second.
+    """
+
+    def __init__(
+        self,
+        shapes: tuple[Shape, ...],
+        pixels: Float[np.ndarray, "frames objects points 2"],
+        places: Float[np.ndarray, "places 2"],
+        image: tuple[int, int],
+        fps: float,
+    ):
+        self.shapes, self.pixels, self.places, self.image, self.fps = shapes, pixels, places, image, fps
+
+    def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Prediction:
+        """The prediction for ``poses`` (of ``Simulator.rollout``) seen with the camera and effects of ``batch``."""
+        bad = np.logical_not(np.isfinite(poses).all((1, 2, 3)))
+        poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
+        seen = acting.apparent(poses, batch, self.fps)
+        drawn = acting.changes_outlines(batch)
+        arrays = (seen, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
+        size = next((b for b in SIZES if b >= len(poses)), -(-len(poses) // SIZES[-1]) * SIZES[-1])
+        device = tuple(
+            jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32) for a in arrays
+        )
+        told, flow = _predict(self.shapes, device, jnp.asarray(self.pixels, jnp.float32), self.image, drawn)
+        told = [np.asarray(a, np.float64)[: len(poses)] for a in told]
+        flow = np.asarray(flow, np.float64)[: len(poses), :-1]
+        reach = told[0]
+        if drawn:
+            focal = (self.image[1] / 2) / np.tan(batch.camera_fovy / 2)
+            rate = np.gradient(reach, axis=1) if reach.shape[1] > 1 else np.zeros_like(reach)
+            view = OutlineView(
+                reach, told[1], rate, directions(DIRECTIONS), told[2], told[3], focal, self.image, self.fps
+            )
+            reach = reach + acting.outline_change(batch, view)
+            flow = self._seen_flow(flow, batch, focal)
+        return Prediction(reach, flow, self._background(batch, len(poses), poses.shape[1]), bad)
+
+    def _seen_flow(self, flow: np.ndarray, batch: SceneBatch, focal: np.ndarray) -> np.ndarray:
+        here = np.broadcast_to(self.pixels[None, :-1], flow.shape)
+        bent = acting.warped(batch, here + flow, focal, self.image) - acting.warped(batch, here, focal, self.image)
+        readout = sum(e.values[:, 0] for e in batch.effects if e.name == "rolling_shutter")
+        if np.ndim(readout):
+            # The later row is exposed later.
+            longer = np.asarray(readout)[:, None, None, None] * self.fps * bent[..., 1] / self.image[1]
+            bent = bent * (1 + longer)[..., None]
+        return bent
+
+    def _background(self, batch: SceneBatch, count: int, frames: int) -> np.ndarray:
+        """Flow of what stands still, at ``places``: of the floor, or of infinity above the horizon."""
+        if not acting.moves_camera(batch):
+            return np.zeros((count, frames - 1, len(self.places), 2))
+        axes, where = acting.camera_path(batch, frames, self.fps)
+        focal = ((self.image[1] / 2) / np.tan(batch.camera_fovy / 2))[:, None]
+        x = (self.places[:, 0] - self.image[0] / 2) / focal
+        y = -(self.places[:, 1] - self.image[1] / 2) / focal
+        ray = np.stack([x, y, -np.ones_like(x)], -1)
+        world = np.einsum("btij,bpj->btpi", axes, ray)
+        down = -world[..., 2]
+        far = 50.0
+        reach = np.where(down > 1e-3, where[:, :, None, 2] / np.maximum(down, 1e-3), far)
+        point = where[:, :, None] + np.clip(reach, 0.05, far)[..., None] * world
+        later = np.einsum("btji,btpj->btpi", axes[:, 1:], point[:, :-1] - where[:, 1:, None])
+        depth = np.maximum(-later[..., 2], 0.02)
+        u = focal[:, :, None] * later[..., 0] / depth + self.image[0] / 2
+        v = -focal[:, :, None] * later[..., 1] / depth + self.image[1] / 2
+        return np.stack([u, v], -1) - self.places

@@ -1,0 +1,166 @@
+"""A linear look ahead: what every effect, at every place where it may begin, would gain (Rao's score test 1948)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
+from mjx_refine.diagnosis.hypothesis import Hypothesis, Term, term
+from mjx_refine.effects import catalogue
+from mjx_refine.effects.kind import EffectKind, FitView, Start
+
+MOST_ROWS = 96
+"""Candidates predicted at a time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Lead:
+    """A start and what it promises.
+
+    Attributes:
+      name: the effect.
+      target: the object, or -1.
+      start: where to begin.
+      gain: of evidence, by the linear look.
+      step: of the varied parameters, in their own units.
+      shift: of the base parameters that goes with it.
+    """
+
+    name: str
+    target: int
+    start: Start
+    gain: float
+    step: Float[np.ndarray, "columns"]
+    shift: Float[np.ndarray, "dimension"]
+
+    def term(self, frames: int) -> Term:
+        """The hypothesis' term."""
+        return term_of(self.name, self.target, self.start, frames)
+
+    def z(self, one: Term) -> Float[np.ndarray, "free"]:
+        """Where the fit begins, in the term's free coordinates."""
+        full = np.zeros(len(one.centre))
+        for (k, _), step in zip(self.start.columns, self.step, strict=True):
+            full[k] = np.clip(step / one.width[k], -4.0, 4.0)
+        return full[one.free]
+
+
+def term_of(name: str, target: int, start: Start, frames: int) -> Term:
+    """The term of a start."""
+    one = term(name, target, frames, start.values)
+    free = one.free.copy()
+    free[list(start.fixed)] = False
+    width = one.width if start.width is None else start.width
+    return dataclasses.replace(one, width=width, free=free, places=start.places)
+
+
+class Screen:
+    """Looks ahead from one fit.
+
+    Args:
+      clip: the clip's residuals.
+      fit: where to look from.
+      view: what kinds need to know to propose starts.
+    """
+
+    def __init__(self, clip: ClipFit, fit: Fit, view: FitView, scale: float = SCALE):
+        self.clip, self.fit, self.view, self.scale = clip, fit, view, scale
+        self.inverse = np.linalg.inv(fit.curvature)
+        self.poses = clip.poses(fit.hypothesis, fit.z[None])
+
+    def leads(self, names: list[str]) -> list[Lead]:
+        """The best few starts of every effect and target, most promising first."""
+        found: list[Lead] = []
+        for name in names:
+            kind = catalogue()[name]
+            for target in range(len(self.view.batch.shapes)) if kind.targeted else (-1,):
+                found += self._family(kind, target)
+        return sorted(found, key=lambda lead: -lead.gain)
+
+    def _family(self, kind: EffectKind, target: int) -> list[Lead]:
+        starts = kind.starts(self.view, target)
+        if not starts:
+            return []
+        white = self._predicted(kind, target, starts)
+        result, row = [], 0
+        for start in starts:
+            count = max(len(start.columns), 1)
+            part = white[row : row + count]
+            row += count
+            result.append(self._lead(kind, target, start, part))
+        return _distinct(sorted(result, key=lambda lead: -lead.gain))
+
+    def _predicted(self, kind: EffectKind, target: int, starts: list[Start]) -> np.ndarray:
+        """Residuals at every start's steps, (rows, R)."""
+        frames = self.clip.frames
+        rows: list[np.ndarray] = []
+        for start in starts:
+            if not start.columns:
+                rows.append(start.values)
+            for k, step in start.columns:
+                row = start.values.copy()
+                row[k] += step
+                rows.append(row)
+        one = dataclasses.replace(term(kind.name, target, frames, starts[0].values), free=np.zeros(len(rows[0]), bool))
+        hypothesis = self.fit.hypothesis.added(one)
+        acts = kind.physical or type(kind).frame_times is not EffectKind.frame_times
+        parts = []
+        for first in range(0, len(rows), MOST_ROWS):
+            values = np.array(rows[first : first + MOST_ROWS])
+            z = np.repeat(self.fit.z[None], len(values), 0)
+            parts.append(self._white(hypothesis, z, values, acts))
+        return np.concatenate(parts)
+
+    def _white(self, hypothesis: Hypothesis, z: np.ndarray, values: np.ndarray, acts: bool) -> np.ndarray:
+        batch = hypothesis.batch(z)
+        effects = (*batch.effects[:-1], dataclasses.replace(batch.effects[-1], values=values))
+        # A slope carries its objects along; its batch must be made with its values.
+        batch = hypothesis.batch_with(z, effects)
+        if acts:
+            self.clip.rollouts += len(z)
+            poses = self.clip.simulator.rollout(batch, self.clip.frames)
+        else:
+            poses = np.repeat(self.poses, len(z), 0)
+        prediction = self.clip.predictor(poses, batch)
+        white = self.clip.whitened(self.clip.distances(prediction), None, self.scale)
+        return np.where(prediction.bad[:, None], 1e3, white)
+
+    def _lead(self, kind: EffectKind, target: int, start: Start, white: np.ndarray) -> Lead:
+        fit, price = self.fit, float(np.log(start.places))
+        if not start.columns:
+            gain, shift = self._finite(white[0])
+            return Lead(kind.name, target, start, gain - price, np.zeros(0), shift)
+        width = start.width if start.width is not None else np.ones(len(start.values))
+        steps = np.array([step for _, step in start.columns])
+        scale = np.array([width[k] for k, _ in start.columns])
+        columns = (white - fit.residual).T / (steps / scale)
+        projected = columns - fit.jacobian @ (self.inverse @ (fit.jacobian.T @ columns))
+        curvature = columns.T @ projected + np.eye(len(steps))
+        gradient = -columns.T @ (fit.residual - fit.jacobian @ (self.inverse @ fit.gradient))
+        step = np.linalg.solve(curvature, gradient)
+        gain = 0.5 * float(gradient @ step) - 0.5 * float(np.linalg.slogdet(curvature)[1])
+        shift = -self.inverse @ (fit.jacobian.T @ (columns @ step) + fit.gradient)
+        return Lead(kind.name, target, start, gain - price, step * scale, shift)
+
+    def _finite(self, white: np.ndarray) -> tuple[float, np.ndarray]:
+        """Gain of a finite change once the base parameters have adapted to it, linearly, and that adaptation."""
+        fit = self.fit
+        before = fit.gradient
+        gradient = before + fit.jacobian.T @ (white - fit.residual)
+        now = fit.cost - fit.data + 0.5 * float(white @ white) - 0.5 * float(gradient @ self.inverse @ gradient)
+        return fit.cost - 0.5 * float(before @ self.inverse @ before) - now, -self.inverse @ gradient
+
+
+def _distinct(leads: list[Lead], most: int = 3) -> list[Lead]:
+    """The best few that do not begin at nearly the same place."""
+    result: list[Lead] = []
+    for lead in leads:
+        width = lead.start.width if lead.start.width is not None else np.ones(len(lead.start.values))
+        if all(np.abs((lead.start.values - other.start.values) / width).max() > 1.5 for other in result):
+            result.append(lead)
+        if len(result) == most:
+            break
+    return result

@@ -1,0 +1,256 @@
+"""Which effect: the base model's fit, then every candidate fitted together with the base parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from mjx_refine.diagnosis.base import base_space, fit_base
+from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.screen import Lead, Screen, term_of
+from mjx_refine.diagnosis.slack import spins
+from mjx_refine.effects import catalogue
+from mjx_refine.effects.hidden_obstacle import HiddenObstacle
+from mjx_refine.effects.kind import FitView
+from mjx_refine.observation import Observation
+from mjx_refine.scene import Scene
+from mjx_refine.space.layout import lowest_extent
+from mjx_refine.view.picture import draw
+from mjx_refine.view.tiles import foreground
+
+FAMILIES = 7
+"""Families (effect and target) that are fitted in full, the most promising first."""
+
+PROMISE = 2.0
+"""Evidence that the linear look must promise for a family to be fitted."""
+
+SECOND_PROMISE = 8.0
+"""Ditto for a second effect beside the first."""
+
+Told = Callable[[str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """One effect (or several) fitted together with the base parameters.
+
+    Attributes:
+      fit: where it ended.
+      lead: of its evidence over the base model's, in natural logarithms.
+      promise: what the linear look said.
+    """
+
+    fit: Fit
+    lead: float
+    promise: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(t.name for t in self.fit.hypothesis.terms)
+
+    @property
+    def targets(self) -> tuple[int, ...]:
+        return tuple(t.target for t in self.fit.hypothesis.terms)
+
+
+@dataclasses.dataclass(frozen=True)
+class Compared:
+    """All hypotheses of one clip.
+
+    Attributes:
+      base: the base model's fit.
+      candidates: single effects, the best evidence first.
+      pairs: two effects, the best evidence first.
+      impacts: how many impacts were allowed slack.
+    """
+
+    base: Fit
+    candidates: tuple[Candidate, ...]
+    pairs: tuple[Candidate, ...]
+    impacts: int
+
+
+def compare(
+    clip: ClipFit,
+    scene: Scene,
+    observation: Observation,
+    masks_of: tuple[int, ...],
+    without: tuple[str, ...],
+    seed: int,
+    told: Told,
+) -> Compared:
+    """Fits the base model, then what the linear look promises.
+
+    Args:
+      clip: residuals.
+      scene: where to start.
+      observation: the clip.
+      masks_of: mask id of each object, or -1.
+      without: effects that are left out of the catalogue.
+      seed: of random hops.
+      told: called with a line for each step.
+    """
+    told("base model")
+    base = fit_base(clip, base_space(scene), observation, masks_of)
+    impacts = clip.allow_slack(base)
+    base = clip.fit(base.hypothesis, base.z, 10)
+    base = clip.hop(base, seed, 2)
+    names = [name for name in catalogue() if name not in without]
+    base, singles = _singles(clip, base, names, scene, observation, masks_of, told)
+    pairs = _pairs(clip, base, singles, names, observation, masks_of, told)
+    return Compared(base, singles, pairs, impacts)
+
+
+def _singles(
+    clip: ClipFit, base: Fit, names, scene, observation, masks_of, told: Told
+) -> tuple[Fit, tuple[Candidate, ...]]:
+    fitted: dict[tuple[str, int], tuple[Fit, float]] = {}
+    for again in range(2):
+        view = view_of(clip, base, observation, masks_of)
+        told("looking ahead")
+        leads = Screen(clip, base, view).leads(names)
+        for lead in _chosen(leads, FAMILIES if again == 0 else 3):
+            told(f"{lead.name} {_target_name(scene, lead.target)}".strip())
+            _fit_lead(clip, base, lead, fitted)
+        _walls_from_pushes(clip, base, fitted, names, view, told)
+        best = max((fit for fit, _ in fitted.values()), key=lambda fit: fit.evidence, default=base)
+        # What an effect's fit found for the base parameters may serve the base model as well.
+        other = clip.fit(base.hypothesis, best.z[: base.hypothesis.dimension], 8) if fitted else base
+        if other.cost > base.cost - 1.0:
+            break
+        base = other
+    finals = [Candidate(fit, fit.evidence - base.evidence, promise) for fit, promise in fitted.values()]
+    finals.sort(key=lambda c: -c.lead)
+    finals = [_polished(clip, c, base) for c in finals[:2]] + finals[2:]
+    return base, tuple(sorted(finals, key=lambda c: -c.lead))
+
+
+def _polished(clip: ClipFit, candidate: Candidate, base: Fit) -> Candidate:
+    if candidate.lead < 0:
+        return candidate
+    fit = clip.fit(candidate.fit.hypothesis, candidate.fit.z, 8)
+    fit = clip.hop(fit if fit.cost < candidate.fit.cost else candidate.fit, 1, 1)
+    return dataclasses.replace(candidate, fit=fit, lead=fit.evidence - base.evidence)
+
+
+def _chosen(leads: list[Lead], families: int) -> list[Lead]:
+    """The best starts of the best families: two where place or moment matter, else one."""
+    kept: dict[tuple[str, int], list[Lead]] = {}
+    for lead in leads:
+        family = kept.setdefault((lead.name, lead.target), [])
+        if len(family) < (2 if lead.start.places > 1 else 1):
+            family.append(lead)
+    best = [family for family in kept.values() if family[0].gain > PROMISE][:families]
+    return [lead for family in best for lead in family]
+
+
+def _fit_lead(clip: ClipFit, base: Fit, lead: Lead, fitted: dict) -> None:
+    one = lead.term(clip.frames)
+    hypothesis = base.hypothesis.added(one)
+    fit = clip.fit(hypothesis, _begin(clip, hypothesis, base, lead, lead.z(one)), 9)
+    key = (lead.name, lead.target)
+    if key not in fitted or fit.evidence > fitted[key][0].evidence:
+        fitted[key] = (fit, lead.gain)
+
+
+def _begin(clip: ClipFit, hypothesis: Hypothesis, base: Fit, lead: Lead, z: np.ndarray) -> np.ndarray:
+    """Where the fit starts: a part of the way that the linear look points, base parameters and effect together."""
+    parts = (0.0, 0.1, 0.3, 0.6, 1.0) if lead.start.columns else (0.0, 0.3, 1.0)
+    limited = np.clip(lead.shift, -10.0, 10.0)
+    return clip.best_of(hypothesis, np.array([np.concatenate([base.z + a * limited, a * z]) for a in parts]))
+
+
+def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: dict, names, view: FitView, told: Told) -> None:
+    """An obstacle begins where a push was found: the wall faces along the impulse."""
+    if "hidden_obstacle" not in names:
+        return
+    for (name, target), (fit, promise) in list(fitted.items()):
+        if name != "push" or fit.evidence < base.evidence + 3.0:
+            continue
+        time, x, y, _ = fit.hypothesis.values(fit.z[None], 0)[0]
+        frame = int(np.clip(round(time * view.fps + 0.25), 0, clip.frames - 1))
+        poses = clip.poses(fit.hypothesis, fit.z[None])[0]
+        if not np.isfinite(poses).all():
+            continue
+        there = dataclasses.replace(view, poses=poses)
+        start = HiddenObstacle().facing(there, target, frame, float(np.degrees(np.arctan2(y, x))))
+        told("hidden_obstacle")
+        lead = Lead("hidden_obstacle", target, dataclasses.replace(start, places=clip.frames), promise, np.zeros(0), base.z * 0)
+        one = term_of(lead.name, target, lead.start, clip.frames)
+        z = np.concatenate([fit.z[: base.hypothesis.dimension], np.zeros(int(one.free.sum()))])
+        wall = clip.fit(base.hypothesis.added(one), z, 9)
+        key = (lead.name, target)
+        if key not in fitted or wall.evidence > fitted[key][0].evidence:
+            fitted[key] = (wall, promise)
+
+
+def _pairs(clip: ClipFit, base: Fit, singles, names, observation, masks_of, told: Told) -> tuple[Candidate, ...]:
+    """Forward selection of a second effect beside the best one or two."""
+    found: list[Candidate] = []
+    for first in singles[:2]:
+        if first.lead < 15.0:
+            break
+        view = view_of(clip, first.fit, observation, masks_of)
+        leads = Screen(clip, first.fit, view).leads(
+            [n for n in names if n not in first.names or catalogue()[n].targeted]
+        )
+        leads = [x for x in leads if (x.name, x.target) not in set(zip(first.names, first.targets, strict=True))]
+        chosen = [x for x in _chosen(leads, 3) if x.gain > SECOND_PROMISE][:3]
+        for lead in chosen:
+            told(f"{first.names[0]} and {lead.name}")
+            one = lead.term(clip.frames)
+            hypothesis = first.fit.hypothesis.added(one)
+            fit = clip.fit(hypothesis, _begin(clip, hypothesis, first.fit, lead, lead.z(one)), 7)
+            found.append(Candidate(fit, fit.evidence - base.evidence, lead.gain))
+    return tuple(sorted(found, key=lambda c: -c.lead))
+
+
+def _target_name(scene: Scene, target: int) -> str:
+    return scene.names[target] if target >= 0 else ""
+
+
+# --- what kinds see ---------------------------------------------------------------------------------------------------
+
+
+def view_of(clip: ClipFit, fit: Fit, observation: Observation, masks_of: tuple[int, ...]) -> FitView:
+    """The fitted rollout, for those who look for a start."""
+    batch = fit.hypothesis.batch(fit.z[None])
+    poses = np.nan_to_num(clip.poses(fit.hypothesis, fit.z[None])[0])
+    fps = clip.simulator.fps
+    velocity = np.gradient(poses[..., :3], axis=0) * fps if len(poses) > 1 else np.zeros_like(poses[..., :3])
+    spin = spins(poses, fps)
+    spin = np.concatenate([spin, spin[-1:]]) if len(spin) else np.zeros_like(velocity)
+    lowest = np.stack(
+        [np.broadcast_to(lowest_extent(s, batch.size[0, n][None], poses[:, n, 3:]), len(poses)) for n, s in enumerate(batch.shapes)], 1
+    )
+    on_floor = poses[..., 2] - lowest < 0.01
+    plain = dataclasses.replace(batch, effects=())
+    hidden = hidden_places(poses, plain, observation, masks_of)
+    return FitView(plain, poses, velocity, spin, on_floor, clip.measured.background, hidden, clip.image, fps)
+
+
+def hidden_places(
+    poses: Float[np.ndarray, "frames objects 7"], batch, observation: Observation, masks_of: tuple[int, ...]
+) -> tuple[tuple[float, float, float, float], ...]:
+    """Rectangles where objects should be seen by the base model and never are, the largest first."""
+    if observation.masks is None:
+        return ()
+    drawn, _ = draw(poses, batch, observation.size)
+    seen = foreground(observation) > 0
+    known = np.isin(drawn, [n + 1 for n, i in enumerate(masks_of) if i >= 0])
+    # A pixel's width of misfit around every outline is no occluder.
+    missing = np.array([ndimage.binary_erosion(d & ~s, iterations=2) for d, s in zip(known, seen, strict=True)])
+    place = ndimage.binary_dilation(missing.any(0), iterations=2) & ~seen.any(0)
+    labels, count = ndimage.label(place)
+    boxes = []
+    for k, box in enumerate(ndimage.find_objects(labels)):
+        area = int((labels[box] == k + 1).sum())
+        if area >= 40:
+            rows, columns = box
+            boxes.append((area, (float(columns.start), float(rows.start), float(columns.stop), float(rows.stop))))
+    del count
+    return tuple(box for _, box in sorted(boxes, reverse=True)[:3])

@@ -1,0 +1,160 @@
+"""How far contacts may be off: no two engines, and no real floor, give the same impulse.
+
+Each impact of the fitted base model may err by a part of its change of velocity and spin. What such an error does to the
+measurements is a column c of a linear model; errors of standard deviation one along K columns C add C C' to the
+covariance of the residuals, which (I + C C')^(-1/2) whitens. So a residual that an impact's error explains costs little,
+and one that it cannot explain costs what it did.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine import rotations
+from mjx_refine.batch import SceneBatch, concatenate
+from mjx_refine.sim.backends import Simulator
+from mjx_refine.sim.model import SUBSTEPS
+
+PART = 0.08
+"""Standard deviation of an impulse's error, as a part of the change of velocity (and, times a radius, of spin)."""
+
+LEAST = 0.25
+"""Changes of velocity within one frame that are taken for an impact [m/s]."""
+
+MOST = 8
+"""Impacts an object that are looked at, strongest first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Impact:
+    """One impact of the fitted model.
+
+    Attributes:
+      target: the object.
+      frame: the first frame after it.
+      change: of velocity [m/s].
+      turn: of spin, times the body's size [m/s].
+    """
+
+    target: int
+    frame: int
+    change: float
+    turn: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Slack:
+    """What whitens residuals that share the impacts' errors: r - U d U' r.
+
+    Attributes:
+      basis: U, orthonormal.
+      shrink: d, in [0, 1).
+    """
+
+    basis: Float[np.ndarray, "residuals slack"]
+    shrink: Float[np.ndarray, "slack"]
+
+    def __call__(self, residuals: Float[np.ndarray, "batch residuals"]) -> Float[np.ndarray, "batch residuals"]:
+        return residuals - ((residuals @ self.basis) * self.shrink) @ self.basis.T
+
+
+def slack_of(columns: Float[np.ndarray, "residuals columns"]) -> Slack:
+    """From the columns C, one standard deviation each."""
+    basis, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return Slack(basis, 1.0 - 1.0 / np.sqrt(1.0 + size**2))
+
+
+def impacts(batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], fps: float) -> list[Impact]:
+    """Impacts of a fitted rollout: where velocity or spin jump by more than gravity does."""
+    velocity = np.diff(poses[..., :3], axis=0) * fps
+    spin = spins(poses, fps)
+    jump = np.diff(velocity, axis=0) - batch.gravity[0] / fps
+    twist = np.diff(spin, axis=0)
+    found = []
+    for n in range(poses.shape[1]):
+        size = float(batch.size[0, n].max())
+        change, turn = np.linalg.norm(jump[:, n], axis=-1), np.linalg.norm(twist[:, n], axis=-1) * size
+        # A body at rest on the floor is held against gravity in every frame: that is no impact.
+        held = np.abs(change - np.linalg.norm(batch.gravity[0]) / fps) < 0.1
+        strength = np.where(held, 0.0, change) + 0.5 * turn
+        frames = [t for t in np.argsort(-strength) if strength[t] > LEAST][:MOST]
+        found += [Impact(n, int(t) + 1, float(change[t]), float(turn[t])) for t in frames]
+    return found
+
+
+def spins(poses: Float[np.ndarray, "frames objects 7"], fps: float) -> Float[np.ndarray, "intervals objects 3"]:
+    """Angular velocities between frames, world frame [rad/s]."""
+    turn = rotations.multiply(poses[1:, :, 3:], rotations.conjugate(poses[:-1, :, 3:]))
+    turn = turn * np.where(turn[..., :1] < 0, -1.0, 1.0)
+    half = np.arccos(np.clip(turn[..., :1], -1.0, 1.0))
+    return 2 * half * turn[..., 1:] / np.maximum(np.sin(half), 1e-9) * fps
+
+
+def kicked(
+    simulator: Simulator, batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], found: list[Impact]
+) -> Float[np.ndarray, "rows frames objects 7"]:
+    """Rollouts that go on from each impact with one standard deviation more of velocity or spin.
+
+    Rows are (impact, three velocities and three spins).
+    """
+    length = len(poses)
+    velocity, spin = states(simulator, batch, poses)
+    starts: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {}
+    rows = np.repeat(poses[None], 6 * len(found), 0)
+    for k, impact in enumerate(found):
+        size = float(batch.size[0, impact.target].max())
+        width = PART * (impact.change + 0.5 * impact.turn)
+        for axis in range(6):
+            dv, dw = np.zeros(3), np.zeros(3)
+            if axis < 3:
+                dv[axis] = width
+            else:
+                dw[axis - 3] = PART * (impact.turn + 0.3 * impact.change) / size
+            starts.setdefault(impact.frame, []).append((6 * k + axis, dv, dw))
+    for frame, members in starts.items():
+        here = _restarted(batch, poses[frame], velocity[frame], spin[frame], len(members))
+        for row, (index, dv, dw) in enumerate(members):
+            n = found[index // 6].target
+            here.linear_velocity[row, n] += dv
+            local = rotations.rotate(rotations.conjugate(here.quaternion[row, n]), dw)
+            here.angular_velocity[row, n] += local
+        plain = _restarted(batch, poses[frame], velocity[frame], spin[frame], 1)
+        both = simulator.rollout(concatenate([here, plain]), length - frame)
+        for row, (index, _, _) in enumerate(members):
+            rows[index, frame:, :, :3] += both[row, :, :, :3] - both[-1, :, :, :3]
+            rows[index, frame:, :, 3:] = _moved(poses[frame:, :, 3:], both[-1, :, :, 3:], both[row, :, :, 3:])
+    return rows
+
+
+def states(simulator: Simulator, batch: SceneBatch, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities and spins in every frame, by backward differences corrected for gravity [m/s, rad/s]."""
+    fps = simulator.fps
+    step = 1.0 / (fps * SUBSTEPS)
+    velocity = np.diff(poses[..., :3], axis=0) * fps
+    spin = spins(poses, fps)
+    free = np.abs(np.diff(velocity, axis=0, prepend=velocity[:1]) - batch.gravity[0] / fps).max(-1) < 0.05
+    late = np.where(free[..., None], batch.gravity[0] * (0.5 / fps - 0.5 * step), 0.0)
+    # After a frame, the next interval's mean velocity is nearer to the truth than the last one's where an impact was.
+    velocity = np.concatenate([velocity - late, velocity[-1:]])
+    return velocity, np.concatenate([spin, spin[-1:]])
+
+
+def _restarted(batch: SceneBatch, pose: np.ndarray, velocity: np.ndarray, spin: np.ndarray, count: int) -> SceneBatch:
+    many = batch.map(lambda a: np.repeat(a[:1], count, 0))
+    quaternion = np.repeat(pose[None, :, 3:], count, 0)
+    return dataclasses.replace(
+        many,
+        position=np.repeat(pose[None, :, :3], count, 0),
+        quaternion=quaternion,
+        linear_velocity=np.repeat(velocity[None], count, 0),
+        angular_velocity=rotations.rotate(rotations.conjugate(quaternion), np.repeat(spin[None], count, 0)),
+    )
+
+
+def _moved(base: np.ndarray, plain: np.ndarray, changed: np.ndarray) -> np.ndarray:
+    """``base`` turned as ``changed`` is turned against ``plain``."""
+    turn = rotations.multiply(changed, rotations.conjugate(plain))
+    return rotations.multiply(turn, base)

@@ -1,0 +1,45 @@
+"""A region of the floor with another friction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Motion, Start
+
+
+class FrictionPatch(EffectKind):
+    """Sliding friction with the floor is ``friction`` while the object's centre is above a disc."""
+
+    name = "friction_patch"
+    sentence = "the floor's friction changes in some region"
+    experiment = (
+        "Slide the object over the same place again, and beside it: a patch acts at its place, a push does not."
+    )
+    physical = True
+    parameters = (
+        EffectParameter("x", "m", 0.1, -1e4, 1e4, 0.0, None),
+        EffectParameter("y", "m", 0.1, -1e4, 1e4, 0.0, None),
+        EffectParameter("radius", "m", 0.15, 1e-3, 1e3, 0.4, None),
+        EffectParameter("friction", "1", 0.4, 0.0, 10.0, 0.4, None),
+    )
+
+    def floor_friction(self, motion: Motion, target: int, values: np.ndarray) -> np.ndarray | None:
+        away = np.linalg.norm(motion.position[..., :2] - values[:, None, :2], axis=-1)
+        return np.where(away < values[:, 2:3], values[:, 3:4], np.nan)
+
+    def starts(self, view: FitView, target: int) -> list[Start]:
+        found = []
+        for n in range(len(view.batch.shapes)):
+            path = view.poses[:, n, :2]
+            length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+            if length[-1] < 0.2 or view.on_floor[:, n].sum() < 5:
+                continue
+            radius = float(np.clip(0.2 * length[-1], 0.08, 0.6))
+            own = float(view.batch.friction[0, n, 0])
+            for at in np.linspace(0.1, 1.0, 7) * length[-1]:
+                centre = [np.interp(at, length, path[:, k]) for k in range(2)]
+                for wide in (1.0, 2.0):
+                    for friction in (0.25 * own, own + 0.5):
+                        found.append(np.array([*centre, wide * radius, friction]))
+        width = [np.array([0.5 * v[2], 0.5 * v[2], 0.4 * v[2], 0.4]) for v in found]
+        return [Start(v, width=w, places=max(len(found), 1)) for v, w in zip(found, width, strict=True)]

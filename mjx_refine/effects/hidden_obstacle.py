@@ -1,0 +1,93 @@
+"""Something unseen that an object hits."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from mjx_refine import rotations
+from mjx_refine.batch import SceneBatch
+from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Loads, Motion, Start, of_target
+
+STIFFNESS = 20000.0
+"""Of the wall's contact [1/s^2]."""
+
+
+class HiddenObstacle(EffectKind):
+    """An upright wall that the target alone feels.
+
+    Its face is n . p = distance with the outward normal n = (cos angle, sin angle, 0). The contact is a damped spring
+    without friction at the body's foremost point; the damping that returns the part e of a speed is that of a linear
+    oscillator, e = exp(-pi z / sqrt(1 - z^2)).
+    """
+
+    name = "hidden_obstacle"
+    sentence = "{target} hits something that is not in the scene"
+    experiment = "Send {target} along the same path again, and along a parallel one: an obstacle stays where it is."
+    targeted = True
+    physical = True
+    parameters = (
+        EffectParameter("angle", "degree", 15.0, -3600.0, 3600.0, 0.0, None),
+        EffectParameter("distance", "m", 0.05, -1e4, 1e4, 0.0, None),
+        EffectParameter("restitution", "1", 0.3, 0.02, 0.98, 0.5, 0.5),
+    )
+
+    def loads(self, motion: Motion, target: int, values: np.ndarray) -> Loads | None:
+        angle = np.deg2rad(values[:, 0])
+        normal = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1)
+        arm = foremost(motion, target, -normal)
+        depth = values[:, 1] - ((motion.position[:, target] + arm) * normal).sum(-1)
+        if not (depth > 0).any():
+            return None
+        velocity = motion.velocity[:, target] + np.cross(motion.spin[:, target], arm)
+        approach = -(velocity * normal).sum(-1)
+        log = -np.log(values[:, 2])
+        damping = 2 * np.sqrt(STIFFNESS) * log / np.hypot(np.pi, log)
+        # A body that starts behind the wall is not thrown out of it.
+        pressed = np.minimum(depth, 0.1) * STIFFNESS + damping * approach
+        size = motion.batch.mass[:, target] * np.where((depth > 0) & (depth < 0.3), np.maximum(pressed, 0.0), 0.0)
+        force = size[:, None] * normal
+        return of_target(motion.batch, target, force), of_target(motion.batch, target, np.cross(arm, force))
+
+    def starts(self, view: FitView, target: int) -> list[Start]:
+        found = []
+        for t in range(2, view.frames - 1, 2):
+            v = view.velocity[t, target, :2]
+            if float(np.linalg.norm(v)) < 0.15:
+                continue
+            heading = float(np.degrees(np.arctan2(-v[1], -v[0])))
+            found += [self.facing(view, target, t, heading + turn) for turn in (-50.0, 0.0, 50.0)]
+        return [dataclasses.replace(start, places=len(found)) for start in found]
+
+    def facing(self, view: FitView, target: int, frame: int, angle: float) -> Start:
+        """The wall with the outward normal at ``angle`` [degree] that the target touches in ``frame``."""
+        turned = np.radians(angle)
+        normal = np.array([[np.cos(turned), np.sin(turned), 0.0]])
+        pose = view.poses[frame : frame + 1, None, target]
+        batch = _alone(view.batch, target)
+        still = Motion(0.0, 1.0, pose[..., :3], pose[..., 3:], pose[..., :3], pose[..., :3], batch)
+        reach = float((foremost(still, 0, -normal) * normal).sum())
+        distance = float(normal[0, :2] @ pose[0, 0, :2]) + reach
+        return Start(np.array([angle, distance, 0.5]), width=np.array([25.0, 0.08, 0.3]))
+
+
+def _alone(batch: SceneBatch, target: int) -> SceneBatch:
+    return dataclasses.replace(batch, shapes=batch.shapes[target : target + 1], size=batch.size[:, target : target + 1])
+
+
+def foremost(motion: Motion, target: int, direction: np.ndarray) -> np.ndarray:
+    """From the target's centre to its point that lies farthest in ``direction`` (batch, 3) [m]."""
+    shape, size = motion.batch.shapes[target], motion.batch.size[:, target]
+    if shape == "sphere":
+        return size[:, :1] * direction
+    matrix = rotations.matrix(motion.quaternion[:, target])
+    local = np.einsum("bij,bi->bj", matrix, direction)
+    if shape == "box":
+        # Flat faces touch at their middle: the sign turns to zero where the face is square to the wall.
+        point = size * np.clip(local / 0.1, -1.0, 1.0)
+    else:
+        across = np.linalg.norm(local[:, :2], axis=-1, keepdims=True)
+        rim = size[:, :1] * local[:, :2] / np.maximum(across, 0.1)
+        point = np.concatenate([rim, size[:, 1:2] * np.clip(local[:, 2:] / 0.1, -1.0, 1.0)], -1)
+    return np.einsum("bij,bj->bi", matrix, point)

@@ -1,0 +1,88 @@
+"""Rollouts in C MuJoCo whose forces depend on the state: a step at a time, all candidates together."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from mujoco import rollout
+
+from mjx_refine import rotations
+from mjx_refine.batch import SceneBatch
+from mjx_refine.effects import acting
+from mjx_refine.effects.kind import Motion
+from mjx_refine.sim.model import SUBSTEPS
+
+
+def stepped_rollout(
+    pool: rollout.Rollout,
+    models: list[mujoco.MjModel],
+    data: list[mujoco.MjData],
+    state: Float[np.ndarray, "batch state"],
+    batch: SceneBatch,
+    frames: int,
+    world: Float[np.ndarray, "batch 3 3"] | None,
+) -> Float[np.ndarray, "batch intervals positions"]:
+    """``qpos`` at the start of frames 1, 2, ... under the loads of the batch's effects.
+
+    The loads of a step are those of the state at its start (explicit, as MuJoCo's Euler integrator has all forces).
+
+    Args:
+      pool: threads.
+      models: one a candidate; the floor's friction is written into them and put back.
+      data: one a thread.
+      state: full physics state at the first frame.
+      batch: the candidates with their effects, in the floor's axes.
+      frames: of the clip.
+      world: floor to world, where they differ: effects think in the world's axes.
+    """
+    count, objects = batch.mass.shape
+    positions, step = 7 * objects, models[0].opt.timestep
+    applied = np.zeros((count, 1, models[0].nbody, 6))
+    usual = np.array([model.pair_friction[:objects, 0] for model in models])
+    current, warm = usual.copy(), np.zeros((count, models[0].nv))
+    result = np.empty((count, frames - 1, positions))
+    spec = mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
+    for k in range((frames - 1) * SUBSTEPS):
+        motion = _motion(state, batch, k * step, step, world)
+        told = acting.loads(batch, motion)
+        applied[:] = 0.0
+        if told is not None:
+            for part, load in enumerate(told):
+                turned = load if world is None else np.einsum("bji,bnj->bni", world, load)
+                applied[:, 0, 1:, 3 * part : 3 * part + 3] = np.nan_to_num(turned)
+        friction = acting.floor_friction(batch, motion)
+        if friction is not None:
+            wanted = np.where(np.isnan(friction), usual, friction)
+            for row in np.nonzero((wanted != current).any(1))[0]:
+                models[row].pair_friction[:objects, :2] = wanted[row, :, None]
+            current = wanted
+        states, _ = pool.rollout(
+            models,
+            data,
+            state,
+            applied.reshape(count, 1, -1),
+            control_spec=spec,
+            nstep=1,
+            initial_warmstart=warm,
+            skip_checks=False,
+        )
+        state = np.array(states)[:, 0]
+        if (k + 1) % SUBSTEPS == 0:
+            result[:, (k + 1) // SUBSTEPS - 1] = state[:, 1 : 1 + positions]
+    for row, model in enumerate(models):
+        model.pair_friction[:objects, :2] = usual[row, :, None]
+    return result
+
+
+def _motion(state: np.ndarray, batch: SceneBatch, time: float, step: float, world: np.ndarray | None) -> Motion:
+    count, objects = batch.mass.shape
+    qpos = state[:, 1 : 1 + 7 * objects].reshape(count, objects, 7)
+    qvel = state[:, 1 + 7 * objects : 1 + 13 * objects].reshape(count, objects, 6)
+    position, quaternion, velocity = qpos[..., :3], qpos[..., 3:], qvel[..., :3]
+    spin = rotations.rotate(quaternion, qvel[..., 3:])
+    if world is not None:
+        position, velocity, spin = (np.einsum("bij,bnj->bni", world, v) for v in (position, velocity, spin))
+        turn = np.broadcast_to(acting.quaternion_of(world)[:, None], quaternion.shape)
+        quaternion = rotations.multiply(turn, quaternion)
+    return Motion(time, step, position, quaternion, velocity, spin, batch)
