@@ -1,0 +1,157 @@
+"""What a diagnosis says."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.scene import Scene
+
+NONE: tuple[str, ...] = ()
+UNKNOWN = ("unknown",)
+
+
+@dataclasses.dataclass(frozen=True)
+class Value:
+    """One fitted parameter of an effect with its 90 % interval."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where simulation and clip part.
+
+    Attributes:
+      object: its name, or None (camera, timing).
+      frames: first and last.
+      phase: ``flight, impact, sliding, rolling, rest, whole``.
+      channel: ``motion, rotation, shape, camera, timing, perception``.
+      share: of the misfit above the noise.
+    """
+
+    object: str | None
+    frames: tuple[int, int]
+    phase: str
+    channel: str
+    share: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Gap:
+    """How far simulation and clip are apart on frames that no fit has seen.
+
+    Attributes:
+      metric: what ``before``, ``after`` and ``noise_floor`` are.
+      held_out: which frames.
+      before: of the base model, refitted.
+      after: with the verdict's effects.
+      noise_floor: what the measurement's noise alone gives.
+      closed: (before - after) / (before - noise_floor).
+      closed_low, closed_high: its 90 % bootstrap interval.
+      iou_before, iou_after, epe_before, epe_after: full-resolution scores of the whole clip.
+    """
+
+    metric: str
+    held_out: str
+    before: float
+    after: float
+    noise_floor: float
+    closed: float
+    closed_low: float
+    closed_high: float
+    iou_before: float
+    iou_after: float
+    epe_before: float
+    epe_after: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Ranked:
+    """One candidate effect.
+
+    Attributes:
+      effect: its name.
+      target: the object's name, or None.
+      probability: that it is at work.
+      evidence: over the base model's, natural logarithms.
+      parameters: fitted values.
+      gap_after: as ``Gap.after`` (by the fit of all frames, where it was not held out).
+      closed: as ``Gap.closed``.
+      sentence: what it says.
+    """
+
+    effect: str
+    target: str | None
+    probability: float
+    evidence: float
+    parameters: dict[str, Value]
+    gap_after: float
+    closed: float
+    sentence: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """The answer.
+
+    Attributes:
+      effects: names; empty: nothing is missing; ``("unknown",)``: something that the catalogue does not hold.
+      probability: that this answer is right.
+      indistinguishable: groups of effects that this clip cannot tell apart.
+      sentence: the answer in words.
+      experiment: what to film next.
+    """
+
+    effects: tuple[str, ...]
+    probability: float
+    indistinguishable: tuple[tuple[str, ...], ...]
+    sentence: str
+    experiment: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """All that a diagnosis found.
+
+    Attributes:
+      verdict: the answer.
+      gap: how far it closes the gap.
+      where: the places of the gap, the largest share first.
+      candidates: effects, the likeliest first.
+      residual: what the gap looks like, in words.
+      remaining: what is left after the verdict's effects, in words.
+      base: the base model's refit.
+      scene: the diagnosed scene, with its effects as entries.
+      matching: mask id of each object, or -1.
+      map_before: root mean square misfit in noise widths.
+      map_after: ditto with the verdict's effects.
+      channels: channel of each object's and frame's misfit, index into ``CHANNELS``.
+      notes: what a reader should know.
+      seconds: how long it took.
+      rollouts: how many were simulated.
+    """
+
+    verdict: Verdict
+    gap: Gap
+    where: tuple[Place, ...]
+    candidates: tuple[Ranked, ...]
+    residual: str
+    remaining: str
+    base: Scene
+    scene: Scene
+    matching: tuple[int, ...]
+    map_before: Float[np.ndarray, "objects frames"]
+    map_after: Float[np.ndarray, "objects frames"]
+    channels: np.ndarray
+    notes: tuple[str, ...]
+    seconds: float
+    rollouts: int
+
+
+CHANNELS = ("motion", "rotation", "shape", "camera", "timing", "perception")
