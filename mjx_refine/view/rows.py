@@ -1,0 +1,153 @@
+"""Rays of rows of a picture, each with its own moment: hits of objects, of changed outlines, of the floor, and their flow."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mjx_refine.scene import Shape
+from mjx_refine.view.distance import distance_of, surface
+from mjx_refine.view.frames import Frames
+from mjx_refine.view.outline import directions, place, support_of
+from mjx_refine.view.rays import FAR, cast
+
+DISTANCE = 50.0
+"""Depth of the background above the horizon [m]."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Rows:
+    """S rows (or whole pictures) with one moment each.
+
+    Attributes:
+      frames: of the objects and, last, of the floor; ``down`` and ``height`` are the floor's.
+      poses: of the objects.
+      view: ``geom_size`` with the floor, camera position, pitch and field of view of each.
+      line: which points belong to it.
+      instant: which change of the outlines belongs to it.
+    """
+
+    frames: Frames
+    poses: Float[Array, "steps objects 7"]
+    view: tuple[Array, ...]
+    line: Int[Array, "steps"]
+    instant: Int[Array, "steps"]
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def cast_rows(
+    shapes: tuple[Shape, ...],
+    image: tuple[int, int],
+    moving: bool,
+    rows: Rows,
+    points: Float[Array, "lines points 2"],
+    visible: Bool[Array, "lines points"],
+    change: Float[Array, "instants objects directions"] | None,
+) -> tuple[Int[Array, "steps points"], Float[Array, "steps points 2"]]:
+    """Ids (0 background) and flow [px] at ``points`` of the straight picture.
+
+    Args:
+      shapes: of the objects.
+      image: (width, height) [px].
+      moving: whether the background flows.
+      rows: moments and what is seen there.
+      points: (x, y) [px].
+      visible: where objects can be seen.
+      change: what is added to the outlines' support functions [px]; None: nothing.
+    """
+    centre = (image[0] / 2, image[1] / 2)
+
+    def one(row: Rows):
+        frames = jax.tree.map(lambda a: a[None], row.frames)
+        at = points[row.line]
+        x, y = at[None, :, 0], at[None, :, 1]
+        if change is None:
+            ids, flow_x, flow_y = cast(shapes, frames, x, y, centre)
+        else:
+            arrays = (row.poses[None, None], row.view[0][None, :-1], *(a[None] for a in row.view[1:]))
+            distance = _changed_distance(shapes, arrays, at, image, change[row.instant])
+            ids, flow_x, flow_y = _cast_outlines(shapes, frames, x, y, centre, distance)
+        ids = jnp.where(visible[row.line], ids, 0)
+        ground = _ground_flow(frames, x, y, centre) if moving else (0.0, 0.0)
+        flow_x, flow_y = jnp.where(ids > 0, flow_x, ground[0]), jnp.where(ids > 0, flow_y, ground[1])
+        return ids[0], jnp.stack([flow_x[0], flow_y[0]], -1)
+
+    return jax.lax.map(one, rows)
+
+
+def _ray(frames: Frames, k: int, x: Array, y: Array, centre: tuple[float, float]):
+    """Origin and direction of the points' rays in body ``k``'s frame."""
+    focal = frames.focal[:, None]
+    u, v = (x - centre[0]) / focal, -(y - centre[1]) / focal
+    ray, origin = frames.ray[:, k], frames.origin[:, k]
+    d = tuple(ray[:, i, 0, None] * u + ray[:, i, 1, None] * v - ray[:, i, 2, None] for i in range(3))
+    return tuple(origin[:, i, None] for i in range(3)), d
+
+
+def _followed(frames: Frames, k: int, hit: tuple[Array, ...], x: Array, y: Array, centre: tuple[float, float]):
+    """Flow of points of body ``k``."""
+    matrix, offset, focal = frames.next_matrix[:, k], frames.next_offset[:, k], frames.focal[:, None]
+    cx, cy, cz = (sum(matrix[:, i, j, None] * hit[j] for j in range(3)) + offset[:, i, None] for i in range(3))
+    depth = jnp.where(cz < -1e-6, -cz, FAR)
+    return focal * cx / depth + centre[0] - x, -focal * cy / depth + centre[1] - y
+
+
+def _ground_flow(frames: Frames, x: Array, y: Array, centre: tuple[float, float]):
+    """Flow of the floor, and above its horizon of what is ``DISTANCE`` away."""
+    o, d = _ray(frames, frames.ray.shape[1] - 1, x, y, centre)
+    reach = jnp.where(d[2] < -1e-3, -o[2] / jnp.minimum(d[2], -1e-3), DISTANCE)
+    reach = jnp.clip(reach, 0.05, DISTANCE)
+    hit = tuple(oi + reach * di for oi, di in zip(o, d, strict=True))
+    return _followed(frames, frames.ray.shape[1] - 1, hit, x, y, centre)
+
+
+def _changed_distance(
+    shapes, arrays, at: Array, image: tuple[int, int], change: Array
+) -> Float[Array, "objects points"]:
+    """Signed distance to outlines whose support functions have grown by ``change`` [px].
+
+    The distance to the outline as it is, along its own edges, and the difference of two maxima of n . x - h(n) over the
+    directions of ``change``, in which what is lost between directions cancels.
+    """
+    placed = place(shapes, arrays, image)
+    shifted = at - jnp.asarray(centre_of(image), at.dtype)
+    normals = jnp.asarray(directions(change.shape[-1]), at.dtype)
+    along = shifted[:, :1] * normals[:, 0] + shifted[:, 1:] * normals[:, 1]
+    result = []
+    for n, shape in enumerate(shapes):
+        plain = distance_of(shape, placed, n, shifted, 64)[0, 0]
+        reach = support_of(shape, placed, n, normals)[0, 0]
+        # Where an effect hides a direction nothing is left.
+        wide = jnp.where(jnp.isnan(change[n]), -FAR, change[n])
+        result.append(plain + (along - reach - wide).max(-1) - (along - reach).max(-1))
+    return jnp.stack(result)
+
+
+def centre_of(image: tuple[int, int]) -> tuple[float, float]:
+    """The principal point [px]."""
+    return image[0] / 2, image[1] / 2
+
+
+def _cast_outlines(shapes, frames: Frames, x: Array, y: Array, centre, distance: Array):
+    """``cast`` with silhouettes where ``distance`` is not positive; beside the body, its nearest point's depth counts."""
+    o, d = _ray(frames, frames.ray.shape[1] - 1, x, y, centre)
+    floor = jnp.where(d[2] < -1e-9, -o[2] / jnp.minimum(d[2], -1e-9), FAR)
+    best = floor = jnp.where(floor > 0.0, floor, FAR)
+    ids = jnp.zeros(x.shape, jnp.int32)
+    flow_x = flow_y = jnp.zeros_like(x)
+    for k, shape in enumerate(shapes):
+        o, d = _ray(frames, k, x, y, centre)
+        near, beside, hit = surface(shape, o, d, tuple(frames.size[:, k, i, None] for i in range(3)))
+        # What an outline has more than its body stands on the floor, not in it.
+        t = jnp.where(hit, near, jnp.minimum(beside, 0.999 * floor))
+        nearer = (distance[k][None] <= 0.0) & (t > 0.0) & (t < best)
+        best, ids = jnp.where(nearer, t, best), jnp.where(nearer, k + 1, ids)
+        place_ = tuple(oi + t * di for oi, di in zip(o, d, strict=True))
+        moved_x, moved_y = _followed(frames, k, place_, x, y, centre)
+        flow_x, flow_y = jnp.where(nearer, moved_x, flow_x), jnp.where(nearer, moved_y, flow_y)
+    return ids, flow_x, flow_y

@@ -1,0 +1,114 @@
+"""What effects change of outlines and of flow at points, without drawing a picture."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.effects import acting
+from mjx_refine.effects.kind import OutlineView
+from mjx_refine.scene import Shape
+from mjx_refine.view.outline import BATCHES, Arrays, directions, larger, place, support_of, supports
+from mjx_refine.view.points import point_flow
+
+
+def outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int], count: int):
+    """(reach, contact, facing, scale) of every silhouette in ``count`` directions, as ``OutlineView`` has them; pure."""
+    placed = place(shapes, arrays, image)
+    normals = jnp.asarray(directions(count), placed.centre.dtype)
+    tangents = jnp.stack([-normals[:, 1], normals[:, 0]], -1)
+    reach, contact, facing, scale = [], [], [], []
+    for n, shape in enumerate(shapes):
+        h, slope = jax.jvp(lambda u, shape=shape, n=n: support_of(shape, placed, n, u), (normals,), (tangents,))
+        # A convex outline's contact point is the gradient of its support function (Schneider, 1.7).
+        point = h[..., None] * normals + slope[..., None] * tangents
+        lean = h / placed.focal
+        outward = jnp.concatenate([jnp.broadcast_to(normals, (*h.shape, 2)), -lean[..., None]], -1)
+        length = jnp.sqrt(1 + lean**2)
+        local = (placed.axes[:, :, n, None] * (outward / length[..., None])[..., :, None]).sum(-2)
+        reach.append(h)
+        contact.append(point + 0.5 * jnp.asarray(image, h.dtype))
+        facing.append(local)
+        scale.append(placed.focal * length / larger(placed.shown[:, :, n, 2], 0.05)[..., None])
+    middle = 0.5 * image[0] * normals[:, 0] + 0.5 * image[1] * normals[:, 1]
+    return jnp.stack(reach, 2) + middle, jnp.stack(contact, 2), jnp.stack(facing, 2), jnp.stack(scale, 2)
+
+
+_outline = jax.jit(outline_function, static_argnums=(0, 2, 3))
+
+
+def focal_length(batch: SceneBatch, image: tuple[int, int]) -> Float[np.ndarray, "batch"]:
+    """Focal lengths [px]."""
+    return (image[1] / 2) / np.tan(batch.camera_fovy / 2)
+
+
+def outline_view(
+    poses: Float[np.ndarray, "batch frames objects 7"],
+    batch: SceneBatch,
+    image: tuple[int, int],
+    count: int,
+    fps: float,
+) -> OutlineView:
+    """The silhouettes of ``poses``, which are ``apparent`` ones, in ``count`` directions."""
+    arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
+    size = next((b for b in BATCHES if b >= len(poses)), -(-len(poses) // BATCHES[-1]) * BATCHES[-1])
+    device = tuple(jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32) for a in arrays)
+    told = _outline(batch.shapes, device, image, count)
+    reach, contact, facing, scale = (np.asarray(a, np.float64)[: len(poses)] for a in told)
+    rate = np.gradient(reach, axis=1) if reach.shape[1] > 1 else np.zeros_like(reach)
+    return OutlineView(reach, contact, rate, directions(count), facing, scale, focal_length(batch, image), image, fps)
+
+
+def seen_supports(
+    poses: Float[np.ndarray, "batch frames objects 7"],
+    batch: SceneBatch,
+    image: tuple[int, int],
+    count: int,
+    fps: float,
+) -> Float[np.ndarray, "batch frames objects directions"]:
+    """``supports`` with the effects of ``batch`` [px]; NaN where they hide everything."""
+    seen = acting.apparent(poses, batch, fps)
+    if not acting.changes_outlines(batch):
+        return supports(seen, batch, image, count)
+    view = outline_view(seen, batch, image, count, fps)
+    return view.reach + acting.outline_change(batch, view)
+
+
+def seen_point_flow(
+    poses: Float[np.ndarray, "batch frames objects 7"],
+    batch: SceneBatch,
+    pixels: Float[np.ndarray, "frames objects points 2"],
+    image: tuple[int, int],
+    fps: float,
+) -> Float[np.ndarray, "batch frames objects points 2"]:
+    """``point_flow`` with the effects of ``batch`` [px/frame]; the lens's bend of the pixels themselves is left out."""
+    flow = point_flow(acting.apparent(poses, batch, fps), batch, pixels, image)
+    return bent_flow(flow, pixels, batch, image, fps) if acting.changes_outlines(batch) else flow
+
+
+def bent_flow(
+    flow: Float[np.ndarray, "batch frames objects points 2"],
+    pixels: Float[np.ndarray, "frames objects points 2"],
+    batch: SceneBatch,
+    image: tuple[int, int],
+    fps: float,
+) -> Float[np.ndarray, "batch frames objects points 2"]:
+    """Flow as lens and shutter show it."""
+    focal = focal_length(batch, image)
+    here = np.broadcast_to(pixels[None], flow.shape)
+    bent = acting.warped(batch, here + flow, focal, image) - acting.warped(batch, here, focal, image)
+    return bent if not rolls(batch) else bent * (1 + readout(batch, fps, image) * bent[..., 1])[..., None]
+
+
+def rolls(batch: SceneBatch) -> bool:
+    """Whether rows are exposed one after another."""
+    return any(e.name == "rolling_shutter" for e in batch.effects)
+
+
+def readout(batch: SceneBatch, fps: float, image: tuple[int, int]) -> Float[np.ndarray, "batch 1 1 1"]:
+    """How much later a row is exposed than the one above it [frames]; for first-order changes of flow."""
+    told = sum((e.values[:, 0] for e in batch.effects if e.name == "rolling_shutter"), np.zeros(len(batch)))
+    return np.asarray(told)[:, None, None, None] * fps / image[1]
