@@ -11,6 +11,7 @@ from pathlib import Path
 
 import click
 
+from mjx_refine.cli.diagnose import diagnose
 from mjx_refine.cli.types import FiniteFloat, Size
 from mjx_refine.errors import InputError
 
@@ -196,3 +197,6 @@ def evaluate(scene: Path, video: Path, truth) -> None:
     if true is not None:
         report["truth"] = compare_scenes(judged, true, str(truth))
     click.echo(json.dumps(report, indent=1))
+
+
+app.add_command(diagnose)

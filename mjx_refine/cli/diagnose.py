@@ -1,0 +1,273 @@
+"""``refine diagnose``: what a simulation lacks to replay a clip."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from mjx_refine.errors import InputError
+
+_PATH = click.Path(path_type=Path)
+RESULTS = ("diagnosed.yaml", "report.html", "diagnosis.json")
+
+
+@click.command()
+@click.option("--init", type=_PATH, multiple=True, help="The refined scene (YAML); of several samples, the best is taken.")
+@click.option("--video", type=_PATH, multiple=True, help="Its clip (npz); give --init and --video again for another clip.")
+@click.option("--poses", type=_PATH, help="Measured poses (npz with time, pos, quat) instead of a clip.")
+@click.option("--out", type=_PATH, required=True, help="Folder for the results.")
+@click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Of everything random.")
+@click.option("--without", multiple=True, metavar="EFFECT", help="An effect to leave out; may be given again.")
+@click.option("--threads", type=click.IntRange(1, 4096), help="Of the simulation; all cores by default.")
+@click.option("--resume", is_flag=True, help="Do nothing if --out holds the diagnosis of this very call.")
+@click.pass_context
+def diagnose(context: click.Context, init, video, poses, out: Path, seed: int, without, threads, resume: bool) -> None:
+    """Says what a scene's simulation lacks to replay a clip: where they part, which effect it is, how far it helps.
+
+    refine diagnose --init refined.yaml --video flows.npz --out diagnosis
+    """
+    _check_call(context, init, video, poses)
+    withheld = _withheld(without)
+    from mjx_refine.files import remove_stale_parts, writable_directory
+
+    writable_directory(out, RESULTS)
+    inputs = Inputs.read(init, video, poses)
+    call = inputs.call(seed, withheld)
+    if resume and _done(out, call["digest"]):
+        click.echo(f"{out / RESULTS[-1]}: the diagnosis of this call is there already; nothing to do")
+        return
+    remove_stale_parts(out)
+    steps = step_display()
+    try:
+        diagnosis, call, clip = _diagnosed(inputs, call, withheld, seed, threads, steps.told)
+        steps.told("report")
+        from mjx_refine.report.diagnosis_files import write_diagnosis
+
+        write_diagnosis(out, diagnosis, clip, call)
+    except KeyboardInterrupt:
+        steps.close()
+        # A diagnosis has no checkpoint: the words of a refinement would promise one.
+        click.echo("refine: interrupted; run the same call again", err=True)
+        raise click.exceptions.Exit(1) from None
+    finally:
+        steps.close()
+    click.echo(f"{diagnosis.verdict.sentence} (probability {diagnosis.verdict.probability:.2f}); {out}/report.html")
+
+
+def _check_call(context: click.Context, init: Sequence[Path], video: Sequence[Path], poses: Path | None) -> None:
+    """Refuses a call whose options do not go together."""
+    if not init:
+        raise click.UsageError("Missing option '--init'", ctx=context)
+    if poses is not None and video:
+        raise click.UsageError("--poses and --video: expected one of them; leave one out", ctx=context)
+    if poses is None and not video:
+        raise click.UsageError("Missing option '--video' (or '--poses')", ctx=context)
+    if poses is not None and len(init) != 1:
+        raise click.UsageError(f"{len(init)} --init with --poses; expected one; give the scene of the poses", ctx=context)
+    if poses is None and len(init) != len(video):
+        raise click.UsageError(
+            f"{len(init)} --init and {len(video)} --video; expected as many of each, in the same order; "
+            "give a --video after every --init",
+            ctx=context,
+        )
+
+
+def _withheld(names: Sequence[str]) -> tuple[str, ...]:
+    """The names once each, in their order.
+
+    Raises:
+      InputError: the catalogue has no such effect.
+    """
+    from mjx_refine.effects import kind_of
+
+    return tuple(dict.fromkeys(kind_of(name, "--without").name for name in names))
+
+
+@dataclasses.dataclass(frozen=True)
+class Inputs:
+    """What was read.
+
+    Attributes:
+      init: the scenes' files.
+      samples: what they hold, see ``mjx_refine.scene.Samples``.
+      video: the clips' files.
+      observations: the clips.
+      poses: file of measured poses, or None.
+    """
+
+    init: tuple[Path, ...]
+    samples: tuple
+    video: tuple[Path, ...]
+    observations: tuple
+    poses: Path | None
+
+    @classmethod
+    def read(cls, init: Sequence[Path], video: Sequence[Path], poses: Path | None) -> Inputs:
+        """Reads scenes and clips, and tells of samples that were left out.
+
+        Raises:
+          InputError: a file is missing or wrong.
+        """
+        from mjx_refine.observation import load_observation
+        from mjx_refine.scene import load_scenes
+
+        samples = tuple(load_scenes(path) for path in init)
+        observations = tuple(load_observation(path) for path in video)
+        if poses is not None and not poses.is_file():
+            raise InputError(f"{poses}: no such file; expected measured poses (npz with time, pos, quat)")
+        for one in samples:
+            for problem in one.problems:
+                click.echo(f"refine: left out: {problem.reason}", err=True)
+        return cls(tuple(init), samples, tuple(video), observations, poses)
+
+    def call(self, seed: int, without: tuple[str, ...]) -> dict[str, Any]:
+        """What was asked for, with a fingerprint of the files and of the options that change the result."""
+        paths = [*self.init, *self.video, *([] if self.poses is None else [self.poses])]
+        state = hashlib.sha256(repr((len(self.init), seed, sorted(without))).encode())
+        for path in paths:
+            with open(path, "rb") as stream:
+                state.update(hashlib.file_digest(stream, "sha256").digest())
+        call: dict[str, Any] = {"init": [path.name for path in self.init], "video": [path.name for path in self.video]}
+        if self.poses is not None:
+            call["poses"] = self.poses.name
+        return {**call, "seed": seed, "without": list(without), "digest": state.hexdigest()}
+
+
+def _done(out: Path, digest: str) -> bool:
+    """Whether ``out`` holds the diagnosis of this very call.
+
+    Raises:
+      InputError: it holds another's, or one that cannot be read.
+    """
+    path = out / RESULTS[-1]
+    if not all((out / name).is_file() for name in RESULTS):
+        return False
+    try:
+        found = json.loads(path.read_text())["call"]["digest"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: not a readable diagnosis ({error}); run again without --resume") from error
+    if found != digest:
+        raise InputError(
+            f"{path}: made for another input or other options; expected those of this call; "
+            "repeat the first call's arguments, or run without --resume"
+        )
+    return True
+
+
+def _diagnosed(inputs: Inputs, call: dict[str, Any], without, seed: int, threads: int | None, told):
+    """The diagnosis, the call with the samples that were taken, and the clip to show (None with poses)."""
+    from mjx_refine import diagnosis
+
+    options = {"without": without, "seed": seed, "threads": threads, "told": told}
+    if inputs.poses is not None:
+        function = _function(diagnosis, "diagnose_poses", "--poses", "give a clip with --video")
+        return function(_only(inputs.samples[0]), inputs.poses, **options), call, None
+    several = len(inputs.observations) > 1
+    function = _function(
+        diagnosis,
+        "diagnose_clips" if several else "diagnose",
+        f"{len(inputs.observations)} pairs of --init and --video" if several else "refine diagnose",
+        "diagnose each clip by itself" if several else "install a version that has it",
+    )
+    scenes, notes, taken = [], [], []
+    for samples, observation in zip(inputs.samples, inputs.observations, strict=True):
+        scene, index, note = best_sample(samples, observation, threads)
+        scenes.append(scene)
+        taken.append(index)
+        if note:
+            click.echo(f"refine: {note}", err=True)
+            notes.append(note)
+    if notes:
+        call = {**call, "sample": taken}
+    if several:
+        notes.append(f"The pictures are of the first of {len(scenes)} clips.")
+        result = function(scenes, list(inputs.observations), **options)
+    else:
+        result = function(scenes[0], inputs.observations[0], **options)
+    return dataclasses.replace(result, notes=(*notes, *result.notes)), call, inputs.observations[0]
+
+
+def _function(module: Any, name: str, asked: str, remedy: str) -> Callable:
+    found = getattr(module, name, None)
+    if found is None:
+        raise InputError(f"{asked}: this version cannot diagnose that yet; {remedy}")
+    return found
+
+
+def _only(samples) -> Any:
+    if len(samples) != 1:
+        raise InputError(
+            f"{samples.source}: {len(samples)} samples; expected one scene beside --poses; name a file with one"
+        )
+    return samples.scenes[0]
+
+
+def best_sample(samples, observation, threads: int | None = None) -> tuple[Any, int, str]:
+    """The scene to diagnose: the only one, or of several the one with the best fitness.
+
+    Args:
+      samples: ``Samples`` of a file.
+      observation: the clip.
+      threads: of the simulation.
+
+    Returns:
+      the scene, its index in the file, and a sentence on how it was chosen (empty if there was no choice).
+    """
+    if len(samples) == 1:
+        return samples.scenes[0], samples.indices[0], ""
+    from mjx_refine.search.options import Options
+    from mjx_refine.search.problem import Problem
+
+    best = Problem(samples, observation, Options(threads=threads)).starts[0]
+    note = (
+        f"{samples.source}: sample {best.index} of {len(samples)} is taken, the one with the best fitness "
+        f"({best.fitness:.3f}, IoU {float(best.scores.iou[0]):.3f})"
+    )
+    return best.scene, best.index, note
+
+
+class Steps:
+    """Shows nothing."""
+
+    def told(self, text: str) -> None:
+        """A step begins."""
+
+    def close(self) -> None:
+        """The run is over."""
+
+
+class TerminalSteps(Steps):
+    """The step at work and the time since the start, in one line on stderr."""
+
+    def __init__(self):
+        from rich.console import Console
+        from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+        self.bar = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            TextColumn("step {task.completed}"),
+            TimeElapsedColumn(),
+            console=Console(stderr=True),
+            transient=True,
+        )
+        self.task = self.bar.add_task("reading", total=None)
+        self.bar.start()
+
+    def told(self, text: str) -> None:
+        self.bar.update(self.task, description=text, advance=1)
+
+    def close(self) -> None:
+        self.bar.stop()
+
+
+def step_display() -> Steps:
+    """A live line where stderr is a terminal, else one that shows nothing."""
+    return TerminalSteps() if sys.stderr.isatty() else Steps()
