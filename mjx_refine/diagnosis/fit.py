@@ -34,11 +34,21 @@ SCALE = 5.0
 
 @dataclasses.dataclass(frozen=True)
 class Noise:
-    """Standard deviations [px], by object where there are several."""
+    """Standard deviations [px].
 
-    edge: Float[np.ndarray, "objects"]
-    flow: Float[np.ndarray, "objects"]
+    Attributes:
+      edge: of outlines.
+      flow: of the objects' flow.
+      background: of the flow beside them.
+    """
+
+    edge: Float[np.ndarray, "frames objects"]
+    flow: Float[np.ndarray, "intervals objects"]
     background: float
+
+
+DRAWS = 12
+"""Pairs of rollouts that measure chaos."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +109,11 @@ class ClipFit:
         self, simulator: Simulator, measured: Measured, image: tuple[int, int], frames: int, noise: Noise | None = None
     ):
         self.simulator, self.measured, self.image, self.frames = simulator, measured, image, frames
-        self.noise = noise or Noise(measured.edge_noise, measured.flow_noise, measured.background_noise)
+        self.noise = noise or Noise(
+            np.repeat(measured.edge_noise[None], frames, 0),
+            np.repeat(measured.flow_noise[None], frames - 1, 0),
+            measured.background_noise,
+        )
         self.predictor = Predictor(simulator.shapes, measured.pixels, measured.places, image, simulator.fps)
         self.rollouts = 0
         self._columns: np.ndarray | None = None
@@ -130,6 +144,29 @@ class ClipFit:
         columns = self.whitened((parts[0], parts[1], parts[2]), None, 1e9)
         self._columns = columns[~moved.bad].T
         return len(found)
+
+    def allow_chaos(self, fit: Fit, seed: int) -> None:
+        """Adds the rollout's own jaggedness around a fit to the noise.
+
+        After contacts the paths of bodies jump with the smallest change of a parameter. Of three rollouts on a line, two
+        of them a posterior standard deviation to either side, the second difference is what no least squares can follow.
+        """
+        generator = np.random.default_rng(seed)
+        factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
+        steps = generator.standard_normal((DRAWS, len(fit.z))) @ factor
+        low, high = fit.hypothesis.bounds
+        z = np.clip(np.concatenate([fit.z + steps, fit.z - steps, fit.z[None]]), low, high)
+        told = self.predictor(self.poses(fit.hypothesis, z), fit.hypothesis.batch(z))
+
+        def bend(values: np.ndarray) -> np.ndarray:
+            second = values[:DRAWS] + values[DRAWS:-1] - 2 * values[-1:]
+            square = np.nan_to_num(np.where(told.bad[:DRAWS].reshape(-1, *(1,) * (second.ndim - 1)), 0.0, second)) ** 2
+            return np.sqrt(np.median(square.reshape(*square.shape[:3], -1).mean(-1), axis=0) / 2.0)
+
+        m = self.measured
+        self.noise = Noise(
+            np.hypot(m.edge_noise, bend(told.reach)), np.hypot(m.flow_noise, bend(told.flow)), self.noise.background
+        )
 
     def _slack(self, keep: np.ndarray | None) -> Slack | None:
         if self._columns is None:
@@ -166,8 +203,8 @@ class ClipFit:
         noise = self.noise
         parts = []
         for raw, sigma, count in (
-            (reach, noise.edge[:, None], EDGE_COUNT / reach.shape[-1]),
-            (flow, noise.flow[:, None, None], FLOW_COUNT / flow.shape[-2]),
+            (reach, noise.edge[:, :, None], EDGE_COUNT / reach.shape[-1]),
+            (flow, noise.flow[:, :, None, None], FLOW_COUNT / flow.shape[-2]),
             (background, noise.background, BACKGROUND_COUNT / max(background.shape[-2], 1)),
         ):
             part = slowed(np.nan_to_num(raw) / sigma, scale) * np.sqrt(count)

@@ -18,7 +18,7 @@ from mjx_refine.search.features import DIRECTIONS
 from mjx_refine.view.outline import Arrays, directions, larger, place, support_of
 from mjx_refine.view.points import point_flow_function
 
-SIZES = (1, 4, 16, 32, 48, 64, 96, 128)
+SIZES = (8, 128)
 """Batch sizes that are compiled."""
 
 

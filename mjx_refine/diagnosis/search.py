@@ -96,6 +96,7 @@ def compare(
     """
     told("base model")
     base = fit_base(clip, base_space(scene), observation, masks_of)
+    clip.allow_chaos(base, seed)
     impacts = clip.allow_slack(base)
     base = clip.fit(base.hypothesis, base.z, 10)
     base = clip.hop(base, seed, 2)

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 from mujoco import rollout
 
-from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting
 from mjx_refine.scene import Shape
+from mjx_refine.sim.carried import carried
 from mjx_refine.sim.model import SUBSTEPS, apply_fields, build_spec, initial_state, model_fields
 from mjx_refine.sim.stepped import stepped_rollout
 
@@ -37,23 +37,37 @@ class MujocoSimulator:
         self.shapes = shapes
         self.fps = fps
         self.threads = threads or os.cpu_count() or 1
-        model = build_spec(shapes, fps).compile()
-        # A diverged candidate must stay diverged: a silent reset would score its first frame again.
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self._models = [model]
-        self._data = [mujoco.MjData(model) for _ in range(self.threads)]
+        self._models = [self._compiled(False)]
+        self._data = [mujoco.MjData(self._models[0]) for _ in range(self.threads)]
+        self._off_centre: tuple[list[mujoco.MjModel], list[mujoco.MjData]] | None = None
         self._pool: rollout.Rollout | None = None
 
+    def _compiled(self, off_centre: bool) -> mujoco.MjModel:
+        model = build_spec(self.shapes, self.fps, off_centre=off_centre).compile()
+        # A diverged candidate must stay diverged: a silent reset would score its first frame again.
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        return model
+
     def _prepare(self, batch: SceneBatch) -> list[mujoco.MjModel]:
+        return self._prepared(batch)[0]
+
+    def _prepared(self, batch: SceneBatch) -> tuple[list[mujoco.MjModel], list[mujoco.MjData]]:
+        """One model a candidate, edited in place, and data for the threads."""
         if batch.shapes != self.shapes:
             raise ValueError(f"scene kind {batch.shapes}; this simulator was made for {self.shapes}")
-        while len(self._models) < len(batch):
-            self._models.append(copy.copy(self._models[0]))
-        fields = model_fields(batch)
         centre = acting.centre_of_mass(batch) if batch.effects else None
+        models, data = self._models, self._data
+        if centre is not None:
+            if self._off_centre is None:
+                model = self._compiled(True)
+                self._off_centre = [model], [mujoco.MjData(model) for _ in range(self.threads)]
+            models, data = self._off_centre
+        while len(models) < len(batch):
+            models.append(copy.copy(models[0]))
+        fields = model_fields(batch)
         for row in range(len(batch)):
-            apply_fields(self._models[row], fields, row, None if centre is None else centre[row])
-        return self._models[: len(batch)]
+            apply_fields(models[row], fields, row, None if centre is None else centre[row])
+        return models[: len(batch)], data
 
     def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
         """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged.
@@ -66,7 +80,7 @@ class MujocoSimulator:
 
     def _positions(self, batch: SceneBatch, frames: int, world: np.ndarray | None) -> np.ndarray:
         """``qpos`` in every frame, (batch, frames, 7 N)."""
-        models = self._prepare(batch)
+        models, data = self._prepared(batch)
         qpos, qvel = initial_state(batch)
         first = qpos.reshape(len(batch), 1, -1)
         if frames == 1:
@@ -77,24 +91,17 @@ class MujocoSimulator:
         if batch.effects and acting.has_loads(batch):
             if self._pool is None:
                 self._pool = rollout.Rollout(nthread=self.threads if self.threads > 1 else 0)
-            data = self._data if self.threads > 1 else self._data[:1]
             later = stepped_rollout(self._pool, models, data, state, batch, frames, world)
         else:
-            states, _ = rollout.rollout(models, self._data, state, nstep=(frames - 1) * SUBSTEPS)
+            states, _ = rollout.rollout(models, data, state, nstep=(frames - 1) * SUBSTEPS)
             later = np.asarray(states)[:, SUBSTEPS - 1 :: SUBSTEPS, 1 : 1 + qpos.shape[1]]
         return np.concatenate([first, later], 1)
 
     def _rollout_with_effects(self, batch: SceneBatch, frames: int) -> np.ndarray:
-        shown = acting.shown_frames(batch, frames)
-        needed = frames if shown is None else int(shown.max()) + 1
-        world = acting.floor_rotation(batch)
-        inside = batch if world is None else acting.turned_state(batch, np.swapaxes(world, -1, -2))
-        poses = self._finished(self._positions(inside, needed, world), batch, needed)
-        if world is not None:
-            place = np.einsum("bij,btnj->btni", world, poses[..., :3])
-            turn = np.broadcast_to(acting.quaternion_of(world)[:, None, None], poses[..., 3:].shape)
-            poses = np.concatenate([place, rotations.multiply(turn, poses[..., 3:])], -1)
-        return poses if shown is None else np.take_along_axis(poses, shown[:, :, None, None], 1)
+        def inner(inside: SceneBatch, needed: int, world: np.ndarray | None) -> np.ndarray:
+            return self._finished(self._positions(inside, needed, world), inside, needed)
+
+        return carried(batch, frames, inner)
 
     def _finished(self, positions: np.ndarray, batch: SceneBatch, frames: int) -> np.ndarray:
         poses = positions.reshape(len(batch), frames, len(self.shapes), 7)

@@ -51,8 +51,14 @@ def contact_pairs(count: int) -> list[tuple[int, int]]:
     return floor + [(i, j) for i in range(count) for j in range(i + 1, count)]
 
 
-def build_spec(shapes: tuple[Shape, ...], fps: float, names: tuple[str, ...] | None = None) -> mujoco.MjSpec:
-    """A spec with the floor, one free body of unit mass for each shape, and explicit contact pairs."""
+def build_spec(
+    shapes: tuple[Shape, ...], fps: float, names: tuple[str, ...] | None = None, off_centre: bool = False
+) -> mujoco.MjSpec:
+    """A spec with the floor, one free body of unit mass for each shape, and explicit contact pairs.
+
+    ``off_centre``: with centres of mass beside the bodies' centres, since the compiler leaves out of a model's mass matrix
+    what is zero where they coincide.
+    """
     names = names or tuple(f"object_{i}" for i in range(len(shapes)))
     spec = mujoco.MjSpec()
     spec.option.timestep = 1.0 / (fps * SUBSTEPS)
@@ -63,6 +69,8 @@ def build_spec(shapes: tuple[Shape, ...], fps: float, names: tuple[str, ...] | N
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 0.05], **free)
     for name, shape in zip(names, shapes, strict=True):
         body = spec.worldbody.add_body(name=name, explicitinertial=True, mass=1.0, inertia=[1.0, 1.0, 1.0])
+        if off_centre:
+            body.ipos = [0.01, 0.01, 0.01]
         body.add_freejoint(name=name)
         body.add_geom(name=name, type=_GEOM[shape], size=[0.1, 0.1, 0.1], **free)
     for first, second in contact_pairs(len(shapes)):
@@ -129,9 +137,9 @@ def apply_fields(
 
     ``centre_of_mass`` is in the bodies' frames [m]; the moments of inertia about it stay those of the uniform body.
     """
-    model.body_ipos[1:] = 0.0 if centre_of_mass is None else centre_of_mass
-    same = mujoco.mjtSameFrame.mjSAMEFRAME_BODY if centre_of_mass is None else mujoco.mjtSameFrame.mjSAMEFRAME_BODYROT
-    model.body_sameframe[1:] = same
+    if centre_of_mass is not None:
+        # Of a model that ``build_spec`` made off centre.
+        model.body_ipos[1:] = centre_of_mass
     model.geom_size[1:] = fields.geom_size[row]
     model.geom_rbound[1:] = fields.geom_rbound[row]
     model.geom_aabb[1:, 3:] = _half_extents(model, fields.geom_size[row])
