@@ -83,9 +83,15 @@ def is_physical(batch: SceneBatch) -> bool:
 
 def has_loads(batch: SceneBatch) -> bool:
     """Whether an effect needs a look at the state in every step."""
-    return any(
-        type(kind).loads is not EffectKind.loads or type(kind).floor_friction is not EffectKind.floor_friction
+    return bool(with_loads(batch))
+
+
+def with_loads(batch: SceneBatch) -> tuple[str, ...]:
+    """Names of the effects that need a look at the state in every step."""
+    return tuple(
+        kind.name
         for kind, _ in _acting(batch)
+        if type(kind).loads is not EffectKind.loads or type(kind).floor_friction is not EffectKind.floor_friction
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import jax
 import numpy as np
@@ -21,6 +21,7 @@ from mjx_refine.space import Space
 
 if TYPE_CHECKING:
     from mjx_refine.gradients import Differentiator
+    from mjx_refine.sim.c import MujocoSimulator
     from mjx_refine.sim.mjx import MjxSimulator
 
 WORK = 40_000
@@ -118,6 +119,9 @@ class DerivativeChoice:
         """What a landing from ``start`` uses beside differences; None for differences alone."""
         if self.options.derivatives != "autodiff":
             return None
+        if start.given.effects:
+            self.message(f"landing from sample {start.index} by differences: automatic ones know nothing of effects")
+            return None
         told = self.judge(start, space, space.start)
         if told.method != "autodiff":
             self.message(f"landing from sample {start.index} by differences: {told.reason}")
@@ -126,7 +130,10 @@ class DerivativeChoice:
 
     def judge(self, start: Start, space: Space, point: Float[np.ndarray, "dimension"]) -> Derivatives:
         """Whether derivatives at ``point`` tell what is around it; automatic ones only if they were asked for."""
-        length, simulator = self.problem.observation.length, self.problem.reference(start.scene.shapes)
+        length, simulator = (
+            self.problem.observation.length,
+            cast("MujocoSimulator", self.problem.as_seen(start.scene.shapes)),
+        )
         frames, most = extent(length, space)
         compare = functools.partial(
             check, space, point, frames, self.problem.observation.size, simulator.fps, simulator=simulator, most=most
@@ -153,7 +160,7 @@ class DerivativeChoice:
         return told
 
     def _compared(self, compare: Callable[..., Verdict], space: Space) -> tuple[Verdict, str]:
-        if self.options.derivatives == "autodiff":
+        if self.options.derivatives == "autodiff" and not space.scene.effects:
             try:
                 return compare(autodiff=self._differentiator(space)), ""
             except UNCOMPILED as error:

@@ -19,8 +19,7 @@ from jaxtyping import Float
 from mjx_refine.batch import SceneBatch
 from mjx_refine.search.features import DIRECTIONS, POINTS, Outlines
 from mjx_refine.space import Space
-from mjx_refine.view.outline import supports
-from mjx_refine.view.points import point_flow
+from mjx_refine.view.seen import seen_point_flow, seen_supports
 
 if TYPE_CHECKING:
     from mjx_refine.search.derivatives import Automatic
@@ -104,6 +103,7 @@ class LeastSquares:
       seed: of the points tried when the horizon grows.
       solver: what runs inside a stage: ``lm``, ours, or one of ``solvers``.
       automatic: derivatives where it has some; None: differences alone.
+      fps: frames a second, for effects.
     """
 
     def __init__(
@@ -118,9 +118,10 @@ class LeastSquares:
         seed: int = 0,
         solver: str = "lm",
         automatic: Automatic | None = None,
+        fps: float = 30.0,
     ):
         self.limit, self.seed, self.solver, self.automatic = limit, seed, solver, automatic
-        self.space, self.rollout, self.image = space, rollout, image
+        self.space, self.rollout, self.image, self.fps = space, rollout, image, fps
         self.pixel = image[0] / 480.0
         target = np.full((len(seen.support), len(columns), DIRECTIONS), np.nan)
         for n, j in enumerate(columns):
@@ -141,10 +142,12 @@ class LeastSquares:
         # The outlines of all frames, so that one length is compiled; those beyond the horizon repeat its last.
         beyond = np.repeat(poses[:, -1:], len(self.target) - frames, axis=1)
         poses = np.concatenate([poses, beyond], 1)
-        reach = supports(poses, batch, self.image, DIRECTIONS)[:, :frames] - self.target[:frames]
+        seen = seen_supports(poses, batch, self.image, DIRECTIONS, self.fps)
+        reach = seen[:, :frames] - self.target[:frames]
         flow = np.full((len(points), frames, len(batch.shapes), 0), np.nan)
         if self.flow is not None and frames > 1:
-            moved = point_flow(poses, batch, self.pixels, self.image)[:, :frames] - self.flow[:frames]
+            moved = seen_point_flow(poses, batch, self.pixels, self.image, self.fps)
+            moved = moved[:, :frames] - self.flow[:frames]
             moved[:, frames - 1] = np.nan
             flow = moved.reshape(*moved.shape[:3], -1)
         return reach / self.pixel, flow / self.pixel, bad

@@ -9,6 +9,7 @@ from mjx_fitness import Scores
 from mjx_refine.sim.backends import Simulator
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.space import Space
+from mjx_refine.view.picture_scorer import PictureScorer
 from mjx_refine.view.tiles import TileScorer
 
 OVERLAP_ALLOWED = 0.002
@@ -28,7 +29,9 @@ class Objective:
       scorer: of pictures.
     """
 
-    def __init__(self, space: Space, simulator: Simulator, reference: MujocoSimulator, scorer: TileScorer):
+    def __init__(
+        self, space: Space, simulator: Simulator, reference: MujocoSimulator, scorer: TileScorer | PictureScorer
+    ):
         self.space, self.simulator, self.reference, self.scorer = space, simulator, reference, scorer
 
     def __call__(self, points: Float[np.ndarray, "batch dimension"]) -> tuple[Float[np.ndarray, "batch"], Scores]:

@@ -5,17 +5,23 @@ from __future__ import annotations
 import dataclasses
 from collections import defaultdict
 
+import numpy as np
+from jaxtyping import Float
 from mjx_fitness import UNMATCHED, Scores
 
-from mjx_refine.batch import batch_from_scenes
-from mjx_refine.errors import InputError
+from mjx_refine.batch import SceneBatch
+from mjx_refine.effects import acting, batch_with_effects
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Samples, Scene, Shape
 from mjx_refine.search.features import Outlines, flow_points, outlines
 from mjx_refine.search.matching import match_objects
 from mjx_refine.search.options import Options
+from mjx_refine.sim.backends import backend_for
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.sim.separate import separate
+from mjx_refine.space.floor import levelled, tilted
+from mjx_refine.view.effects import needs_pictures
+from mjx_refine.view.picture_scorer import PictureScorer
 from mjx_refine.view.tiles import TileScorer, foreground
 
 
@@ -53,19 +59,17 @@ class Problem:
       options: weights, threads.
 
     Raises:
-      InputError: a scene has effects, or nothing can be scored.
+      InputError: an effect of a scene is wrong, or the backend cannot carry it.
     """
 
     def __init__(self, samples: Samples, observation: Observation, options: Options):
         self.samples, self.observation, self.options = samples, observation, options
         self._simulators: dict[tuple[Shape, ...], MujocoSimulator] = {}
-        self._scorers: dict[tuple, TileScorer] = {}
-        for index, scene in zip(samples.indices, samples.scenes, strict=True):
-            if scene.effects:
-                raise InputError(
-                    f"{samples.source}: sample {index} has an effect ({scene.effects[0].effect}); this version "
-                    "simulates the base model alone; remove the entries of type effect"
-                )
+        self._scorers: dict[tuple, TileScorer | PictureScorer] = {}
+        # Wrong effects are told before anything is compiled.
+        self.backends = {
+            kind_of_scene(scene): backend_for(options.backend, batch_with_effects([scene])) for scene in samples.scenes
+        }
         masks = foreground(observation)
         self.seen: Outlines = outlines(masks)
         self.flow = flow_points(masks, observation.flow, self.seen.ids)
@@ -77,20 +81,29 @@ class Problem:
             self._simulators[shapes] = MujocoSimulator(shapes, self.observation.fps, self.options.threads)
         return self._simulators[shapes]
 
+    def as_seen(self, shapes: tuple[Shape, ...]) -> Seen:
+        """C MuJoCo, with poses as the still camera would see them."""
+        return Seen(self.reference(shapes))
+
     def scorer(
-        self, shapes: tuple[Shape, ...], matching: tuple[int, ...], resolution: tuple[int, int] | None = None
-    ) -> TileScorer:
-        """The scorer at a resolution, full if None."""
-        key = (shapes, matching, resolution)
+        self,
+        shapes: tuple[Shape, ...],
+        matching: tuple[int, ...],
+        resolution: tuple[int, int] | None = None,
+        pictures: bool = False,
+    ) -> TileScorer | PictureScorer:
+        """The scorer at a resolution, full if None; ``pictures``: of scenes whose effects change what is seen."""
+        key = (shapes, matching, resolution, pictures)
         if key not in self._scorers:
-            self._scorers[key] = TileScorer(shapes, self.observation, matching, resolution, self.options.weights)
+            made = PictureScorer if pictures else TileScorer
+            self._scorers[key] = made(shapes, self.observation, matching, resolution, self.options.weights)
         return self._scorers[key]
 
     def score(self, scenes: list[Scene], matching: tuple[int, ...]) -> Scores:
         """Full-resolution scores of scenes of one kind, simulated by C MuJoCo."""
-        batch = batch_from_scenes(scenes)
+        batch = batch_with_effects(scenes)
         poses = self.reference(batch.shapes).rollout(batch, self.observation.length)
-        return self.scorer(batch.shapes, matching)(poses, batch)
+        return self.scorer(batch.shapes, matching, pictures=needs_pictures(batch))(poses, batch)
 
     def columns(self, matching: tuple[int, ...]) -> tuple[int, ...]:
         """For each object the column of ``seen`` that it is matched to, or -1."""
@@ -98,15 +111,15 @@ class Problem:
 
     def _ranked(self) -> list[Start]:
         """All samples, best fitness first."""
-        kinds: dict[tuple[Shape, ...], list[int]] = defaultdict(list)
+        kinds: dict[tuple, list[int]] = defaultdict(list)
         for row, scene in enumerate(self.samples.scenes):
-            kinds[scene.shapes].append(row)
+            kinds[kind_of_scene(scene)].append(row)
         starts = []
-        for shapes, rows in kinds.items():
+        for (shapes, *_), rows in kinds.items():
             simulator = self.reference(shapes)
-            separated = [separate(self.samples.scenes[row], simulator) for row in rows]
-            batch = batch_from_scenes([scene for scene, _ in separated])
-            poses = simulator.rollout(batch, min(3, self.observation.length))
+            separated = [_separated(self.samples.scenes[row], simulator) for row in rows]
+            batch = batch_with_effects([scene for scene, _ in separated])
+            poses = self.as_seen(shapes).rollout(batch, min(3, self.observation.length))
             groups: dict[tuple[int, ...], list[int]] = defaultdict(list)
             for k in range(len(rows)):
                 groups[match_objects(poses[k], batch, k, self.seen, self.observation.size)].append(k)
@@ -118,3 +131,34 @@ class Problem:
                         Start(self.samples.indices[rows[k]], given, scene, moved, matching, scores.candidate(i))
                     )
         return sorted(starts, key=lambda start: (-start.fitness, start.index))
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """Rollouts as the still camera would see them, for what looks at outlines and knows nothing of effects."""
+
+    simulator: MujocoSimulator
+
+    @property
+    def fps(self) -> float:
+        return self.simulator.fps
+
+    def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
+        """Poses at the start of every frame; NaN from where a candidate diverged."""
+        poses = self.simulator.rollout(batch, frames)
+        return acting.apparent(poses, batch, self.fps) if batch.effects else poses
+
+
+def kind_of_scene(scene: Scene) -> tuple:
+    """Scenes of one kind can be one batch: (shapes, effects, their targets and the lengths of their series)."""
+    effects = tuple(
+        (e.effect, e.target, tuple((k, len(v)) for k, v in e.parameters if isinstance(v, tuple))) for e in scene.effects
+    )
+    return scene.shapes, effects
+
+
+def _separated(scene: Scene, simulator: MujocoSimulator) -> tuple[Scene, float]:
+    """``separate``, from a tilted floor too."""
+    flat = levelled(scene)
+    apart, moved = separate(flat, simulator)
+    return (tilted(apart), moved) if moved else (scene, moved)

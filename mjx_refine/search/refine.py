@@ -8,8 +8,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from mjx_refine.batch import batch_from_scenes
 from mjx_refine.compile_cache import enable_cache
+from mjx_refine.effects import batch_with_effects
 from mjx_refine.errors import InputError
 from mjx_refine.files import remove_stale_parts
 from mjx_refine.observation import Observation
@@ -20,9 +20,8 @@ from mjx_refine.search.problem import Problem
 from mjx_refine.search.progress import Progress
 from mjx_refine.search.result import ParameterRow, RefineResult, Replay
 from mjx_refine.search.run import Found, Run
-from mjx_refine.sim.backends import resolve_backend
 from mjx_refine.space import Space
-from mjx_refine.view.picture import draw
+from mjx_refine.view.effects import draw_effects, needs_pictures
 
 CHECKPOINT = "checkpoint.npz"
 UNDETERMINED = "one prior width changes the fitness by less than 0.002; kept at its start"
@@ -69,7 +68,6 @@ def refine(
     began, compiled = time.monotonic(), _COMPILE["seconds"]
     samples = _as_samples(samples)
     enable_cache()
-    resolve_backend(options.backend)
     problem = Problem(samples, observation, options)
     checkpoint = None if folder is None else _made(Path(folder)) / CHECKPOINT
     run = Run(problem, progress or Progress(), checkpoint, resume)
@@ -124,10 +122,11 @@ def _as_samples(samples: Samples | Scene | list[Scene]) -> Samples:
 
 def replay(scene: Scene, observation: Observation, problem: Problem, matching: tuple[int, ...]) -> Replay:
     """Simulates a scene in C MuJoCo, draws and scores it at full resolution."""
-    batch = batch_from_scenes([scene])
+    batch = batch_with_effects([scene])
     poses = problem.reference(batch.shapes).rollout(batch, observation.length)
-    masks, flow = draw(np.nan_to_num(poses[0], nan=-1e3), batch, observation.size)
-    return Replay(scene, poses[0], masks, flow, problem.scorer(batch.shapes, matching)(poses, batch))
+    masks, flow = draw_effects(np.nan_to_num(poses[0], nan=-1e3), batch, observation.size, observation.fps)
+    scorer = problem.scorer(batch.shapes, matching, pictures=needs_pictures(batch))
+    return Replay(scene, poses[0], masks, flow, scorer(poses, batch))
 
 
 def _rows(found: Found) -> tuple[ParameterRow, ...]:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from mjx_fitness import Scores
 
+from mjx_refine.effects import batch_with_effects
 from mjx_refine.scene import Scene
 from mjx_refine.search.checkpoint import damaged, digest, load_checkpoint, save_checkpoint
 from mjx_refine.search.derivatives import DerivativeChoice, Derivatives
@@ -18,11 +19,12 @@ from mjx_refine.search.intervals import Intervals, intervals
 from mjx_refine.search.landed import LANDED_WELL, Landed, first_covariance
 from mjx_refine.search.landing import LeastSquares, stages
 from mjx_refine.search.objective import Objective
-from mjx_refine.search.problem import Problem, Start
+from mjx_refine.search.problem import Problem, Start, kind_of_scene
 from mjx_refine.search.progress import Progress, Step
 from mjx_refine.search.undetermined import back_to_start, insensitive
 from mjx_refine.sim.backends import make_simulator
 from mjx_refine.space import Space
+from mjx_refine.view.effects import needs_pictures
 
 SEARCH_WIDTH = 160
 """Samples across a picture during the search, by default."""
@@ -127,7 +129,8 @@ class Run:
         simulator_name, device = "mujoco", "cpu"
         searching = time.monotonic()
         if self.options.optimizer != "gradient":
-            simulator = make_simulator(self.options.backend, start.scene.shapes, self.problem.observation.fps)
+            backend = self.problem.backends[kind_of_scene(start.given)]
+            simulator = make_simulator(backend, start.scene.shapes, self.problem.observation.fps)
             simulator_name, device = simulator.name, simulator.device
             objective = self._objective(start, space, simulator)
             reason, found = self._search(objective, mean, covariance)
@@ -145,7 +148,8 @@ class Run:
 
     def _objective(self, start: Start, space: Space, simulator=None) -> Objective:
         reference = self.problem.reference(start.scene.shapes)
-        scorer = self.problem.scorer(start.scene.shapes, start.matching, self.resolution)
+        pictures = needs_pictures(batch_with_effects([start.scene]))
+        scorer = self.problem.scorer(start.scene.shapes, start.matching, self.resolution, pictures)
         return Objective(space, simulator or reference, reference, scorer)
 
     # Land ---------------------------------------------------------------------------------------------------------
@@ -203,6 +207,7 @@ class Run:
             limit=limit,
             seed=self.options.seed,
             solver=self.options.solver,
+            fps=reference.fps,
         )
 
     def _beginning(self) -> tuple[Start, Space, np.ndarray, np.ndarray]:

@@ -8,8 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.batch import SceneBatch
+from mjx_refine.effects import acting
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Shape
+from mjx_refine.sim.carried import refuse_loads
 
 BACKENDS = ("auto", "mjx", "warp", "mujoco")
 
@@ -43,6 +45,21 @@ def resolve_backend(name: str) -> str:
     if problem and name == "warp":
         raise InputError(f"backend warp: {problem}; {REMEDY}")
     return "mujoco" if problem else "warp"
+
+
+def backend_for(name: str, batch: SceneBatch) -> str:
+    """The backend that ``name`` means for scenes like ``batch``: ``auto`` is mujoco where the fastest lacks an effect.
+
+    Raises:
+      InputError: no such backend, or one that cannot run here or cannot carry an effect.
+    """
+    resolved = resolve_backend(name)
+    if resolved == "mujoco" or not acting.has_loads(batch):
+        return resolved
+    if name == "auto":
+        return "mujoco"
+    refuse_loads(batch, resolved)
+    return resolved
 
 
 def make_simulator(name: str, shapes: tuple[Shape, ...], fps: float) -> Simulator:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from mjx_refine.batch import SceneBatch
+from mjx_refine.effects import acting
 from mjx_refine.scene import Shape
 from mjx_refine.sim.mjx_import import mjx
 from mjx_refine.sim.model import model_fields
@@ -27,12 +28,16 @@ class Leaves(NamedTuple):
     pair_solref: Float[Array, "pairs 2"]
     pair_solreffriction: Float[Array, "pairs 2"]
     gravity: Float[Array, "3"]
+    body_ipos: Float[Array, "objects 3"] | None = None
+    """Centres of mass in the bodies' frames [m]; None: at the centres, and nothing is computed with them."""
 
 
 def leaves_of(batch: SceneBatch) -> Leaves:
     """The leaves of every candidate, with a leading batch axis, in JAX's default precision."""
     fields = model_fields(batch)
-    return Leaves(*(jnp.asarray(getattr(fields, f.name)) for f in dataclasses.fields(fields)))
+    leaves = Leaves(*(jnp.asarray(getattr(fields, f.name)) for f in dataclasses.fields(fields)))
+    centre = acting.centre_of_mass(batch) if batch.effects else None
+    return leaves if centre is None else leaves._replace(body_ipos=jnp.asarray(centre))
 
 
 def candidate_model(base: mjx.Model, leaves: Leaves, shapes: tuple[Shape, ...]) -> mjx.Model:
@@ -42,6 +47,7 @@ def candidate_model(base: mjx.Model, leaves: Leaves, shapes: tuple[Shape, ...]) 
         return jnp.concatenate([old[:1], new.astype(old.dtype)])
 
     mass = leaves.body_mass
+    centre = {} if leaves.body_ipos is None else {"body_ipos": keep_first(base.body_ipos, leaves.body_ipos)}
     changed = base.tree_replace(
         {
             "geom_size": keep_first(base.geom_size, leaves.geom_size),
@@ -56,6 +62,7 @@ def candidate_model(base: mjx.Model, leaves: Leaves, shapes: tuple[Shape, ...]) 
             "pair_solref": leaves.pair_solref,
             "pair_solreffriction": leaves.pair_solreffriction,
             "opt.gravity": leaves.gravity,
+            **centre,
         }
     )
     return cast(mjx.Model, changed)

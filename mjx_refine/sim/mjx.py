@@ -11,7 +11,9 @@ from jaxtyping import Array, Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.compile_cache import compiling
+from mjx_refine.effects import acting
 from mjx_refine.scene import Shape
+from mjx_refine.sim.carried import carried, refuse_loads
 from mjx_refine.sim.colliders import installed
 from mjx_refine.sim.leaves import Leaves, candidate_model, leaves_of
 from mjx_refine.sim.mjx_import import mjx
@@ -47,15 +49,24 @@ class MjxSimulator:
       fps: frames a second; the time step is 1 / (8 fps).
       iterations: Newton iterations a step (1 is unsound with six-dimensional contacts).
       ls_iterations: line-search iterations a Newton iteration.
+      off_centre: for centres of mass that are not at the bodies' centres.
     """
 
     name = "mjx"
 
-    def __init__(self, shapes: tuple[Shape, ...], fps: float, iterations: int = 20, ls_iterations: int = 20):
+    def __init__(
+        self,
+        shapes: tuple[Shape, ...],
+        fps: float,
+        iterations: int = 20,
+        ls_iterations: int = 20,
+        off_centre: bool = False,
+    ):
         self.shapes = shapes
         self.fps = fps
+        self._beside = functools.cache(lambda: MjxSimulator(shapes, fps, iterations, ls_iterations, True))
         self.device = jax.devices()[0].platform
-        model = build_spec(shapes, fps).compile()
+        model = build_spec(shapes, fps, off_centre=off_centre).compile()
         # Single precision cannot reach the default of 1e-8: the solver would iterate on rounding noise, in flight too.
         model.opt.tolerance = 1e-6
         model.opt.iterations = iterations
@@ -114,9 +125,23 @@ class MjxSimulator:
         return np.asarray(jax.jit(jax.vmap(one))(leaves_of(batch), jnp.asarray(qpos)), np.float64)
 
     def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
-        """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged."""
+        """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged.
+
+        With effects on the floor, the centres of mass and the timing; those on the view are ``effects.acting.apparent``'s.
+
+        Raises:
+          InputError: an effect asks for the state in every step.
+        """
         if batch.shapes != self.shapes:
             raise ValueError(f"scene kind {batch.shapes}; this simulator was made for {self.shapes}")
+        if not batch.effects:
+            return self._rollout(batch, frames)
+        refuse_loads(batch, self.name)
+        # Where no centre of mass lies beside its body's, the compiler leaves the zeros out of the mass matrix.
+        simulator = self if acting.centre_of_mass(batch) is None else self._beside()
+        return carried(batch, frames, lambda inside, needed, _: simulator._rollout(inside, needed))
+
+    def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
         full = padded(batch)
         qpos, qvel = initial_state(full)
         arguments = (leaves_of(full), jnp.asarray(qpos), jnp.asarray(qvel))

@@ -13,8 +13,10 @@ from jaxtyping import Array, Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.compile_cache import compiling
+from mjx_refine.effects import acting
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Shape
+from mjx_refine.sim.carried import carried, refuse_loads
 from mjx_refine.sim.leaves import Leaves, candidate_model, leaves_of
 from mjx_refine.sim.mjx import diverged_to_nan, padded
 from mjx_refine.sim.mjx_import import mjx
@@ -57,6 +59,7 @@ class WarpSimulator:
       iterations: Newton iterations a step at most.
       ls_iterations: line-search iterations a Newton iteration at most.
       any_device: also run on a CPU (through Warp's CPU kernels, slow; for tests).
+      off_centre: for centres of mass that are not at the bodies' centres.
 
     Raises:
       InputError: Warp is not installed, or there is no NVIDIA GPU.
@@ -71,14 +74,16 @@ class WarpSimulator:
         iterations: int = 50,
         ls_iterations: int = 50,
         any_device: bool = False,
+        off_centre: bool = False,
     ):
         problem = warp_problem()
         if problem and not (any_device and importlib.util.find_spec("warp")):
             raise InputError(f"backend warp: {problem}; {REMEDY}")
         self.shapes = shapes
         self.fps = fps
+        self._beside = functools.cache(lambda: WarpSimulator(shapes, fps, iterations, ls_iterations, any_device, True))
         self.device = jax.devices()[0].device_kind
-        self._mujoco = build_spec(shapes, fps).compile()
+        self._mujoco = build_spec(shapes, fps, off_centre=off_centre).compile()
         self._mujoco.opt.iterations = iterations
         self._mujoco.opt.ls_iterations = ls_iterations
         model = mjx.put_model(self._mujoco, impl="warp")
@@ -119,9 +124,23 @@ class WarpSimulator:
         return self._programs[size, frames]
 
     def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
-        """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged."""
+        """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged.
+
+        With effects on the floor, the centres of mass and the timing; those on the view are ``effects.acting.apparent``'s.
+
+        Raises:
+          InputError: an effect asks for the state in every step.
+        """
         if batch.shapes != self.shapes:
             raise ValueError(f"scene kind {batch.shapes}; this simulator was made for {self.shapes}")
+        if not batch.effects:
+            return self._rollout(batch, frames)
+        refuse_loads(batch, self.name)
+        # Where no centre of mass lies beside its body's, the compiler leaves the zeros out of the mass matrix.
+        simulator = self if acting.centre_of_mass(batch) is None else self._beside()
+        return carried(batch, frames, lambda inside, needed, _: simulator._rollout(inside, needed))
+
+    def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
         full = padded(batch)
         qpos, qvel = initial_state(full)
         arguments = (leaves_of(full), jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))

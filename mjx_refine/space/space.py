@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch, batch_from_scenes, scene_from_batch
 from mjx_refine.scene import Scene
-from mjx_refine import rotations
+from mjx_refine.space.floor import levelled, with_effects
 from mjx_refine.space.layout import body_parameters, is_upright, lowest_extent, world_parameters
 from mjx_refine.space.parameter import Parameter
 
@@ -19,7 +20,8 @@ class Space:
     """All free parameters around a starting scene.
 
     Attributes:
-      scene: the start; whatever is no parameter stays as it is there.
+      scene: the start; whatever is no parameter stays as it is there. Where an effect tilts the floor, as it would stand
+        on a level one.
       parameters: the coordinates of the unit box, in order.
       fixed: (name, reason) of what does not vary.
       held: former parameters and their values, which need not be those of the scene.
@@ -37,6 +39,7 @@ class Space:
         Fixed from the outset: the mass of a lone object and, of several, that of the first (only ratios act), a sphere's
         orientation and a cylinder's turn about its axis (they cannot be seen), contact stiffness (bounce is damping's).
         """
+        scene = levelled(scene)
         batch = batch_from_scenes([scene])
         parameters: list[Parameter] = []
         fixed: list[tuple[str, str]] = []
@@ -114,7 +117,7 @@ class Space:
             i, k = parameter.index
             target = raw[parameter.field]
             target[(slice(None), k) if i < 0 else (slice(None), i, k)] = value
-        return self._assemble(base, raw)
+        return with_effects(self._assemble(base, raw), self.scene)
 
     def _intermediate(self, base: SceneBatch) -> dict[str, np.ndarray]:
         count, objects = base.mass.shape

@@ -282,14 +282,21 @@ def _widened(masks: np.ndarray, poses: np.ndarray, one: SceneBatch, size, fps: f
             if not inside.any():
                 continue
             edges = np.pad(inside, 1, mode="edge")
-            away = ndimage.distance_transform_edt(~edges) if not edges.all() else np.zeros(edges.shape)
-            within = ndimage.distance_transform_edt(edges) if not edges.all() else np.full(edges.shape, np.inf)
-            signed = (np.where(edges, 0.5 - within, away - 0.5) / FINE)[1:-1, 1:-1]
+            signed = _signed_distance(edges)[1:-1, 1:-1] / FINE
             depth[n] = signed[middle::FINE, middle::FINE]
         best = depth.argmin(0)
         grown = np.where(depth.min(0) <= width, best + 1, 0)
         result[t][part[0], part[1]] = grown
     return result
+
+
+def _signed_distance(inside: np.ndarray) -> np.ndarray:
+    """Distance to the edge of a region [samples], negative inside, -inf where there is no edge."""
+    if inside.all():
+        return np.full(inside.shape, -np.inf)
+    away = np.asarray(ndimage.distance_transform_edt(~inside))
+    within = np.asarray(ndimage.distance_transform_edt(inside))
+    return np.where(inside, 0.5 - within, away - 0.5)
 
 
 def _fine_ids(poses: np.ndarray, one: SceneBatch, grids: list[np.ndarray], size, fps: float, t: int) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +24,7 @@ def outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int
     tangents = jnp.stack([-normals[:, 1], normals[:, 0]], -1)
     reach, contact, facing, scale = [], [], [], []
     for n, shape in enumerate(shapes):
-        h, slope = jax.jvp(lambda u, shape=shape, n=n: support_of(shape, placed, n, u), (normals,), (tangents,))
+        h, slope = jax.jvp(functools.partial(support_of, shape, placed, n), (normals,), (tangents,))
         # A convex outline's contact point is the gradient of its support function (Schneider, 1.7).
         point = h[..., None] * normals + slope[..., None] * tangents
         lean = h / placed.focal
