@@ -19,8 +19,12 @@ RESULTS = ("diagnosed.yaml", "report.html", "diagnosis.json")
 
 
 @click.command()
-@click.option("--init", type=_PATH, multiple=True, help="The refined scene (YAML); of several samples, the best is taken.")
-@click.option("--video", type=_PATH, multiple=True, help="Its clip (npz); give --init and --video again for another clip.")
+@click.option(
+    "--init", type=_PATH, multiple=True, help="The refined scene (YAML); of several samples, the best is taken."
+)
+@click.option(
+    "--video", type=_PATH, multiple=True, help="Its clip (npz); give --init and --video again for another clip."
+)
 @click.option("--poses", type=_PATH, help="Measured poses (npz with time, pos, quat) instead of a clip.")
 @click.option("--out", type=_PATH, required=True, help="Folder for the results.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Of everything random.")
@@ -70,7 +74,9 @@ def _check_call(context: click.Context, init: Sequence[Path], video: Sequence[Pa
     if poses is None and not video:
         raise click.UsageError("Missing option '--video' (or '--poses')", ctx=context)
     if poses is not None and len(init) != 1:
-        raise click.UsageError(f"{len(init)} --init with --poses; expected one; give the scene of the poses", ctx=context)
+        raise click.UsageError(
+            f"{len(init)} --init with --poses; expected one; give the scene of the poses", ctx=context
+        )
     if poses is None and len(init) != len(video):
         raise click.UsageError(
             f"{len(init)} --init and {len(video)} --video; expected as many of each, in the same order; "

@@ -36,7 +36,8 @@ def diagnosis_numbers(diagnosis: Diagnosis, call: Mapping[str, Any] | None = Non
         },
         "gap": _gap(diagnosis.gap),
         "where": [
-            {**dataclasses.asdict(place), "share": _rounded(max(0.0, place.share), 4)} for place in _sorted_places(diagnosis)
+            {**dataclasses.asdict(place), "share": _rounded(max(0.0, place.share), 4)}
+            for place in _sorted_places(diagnosis)
         ],
         "candidates": [_candidate(one) for one in diagnosis.candidates],
         "residual": {"description": diagnosis.residual, "remaining": diagnosis.remaining},

@@ -18,11 +18,12 @@ from mjx_refine.observation import Observation
 from mjx_refine.report import encode, plots, tables
 from mjx_refine.report.contours import Overlay, colour, fitted, pale
 from mjx_refine.report.diagnosis_plots import CHANNEL_COLOURS, Rows, gap_bars, misfit_map, top_of
-from mjx_refine.report.diagnosis_replay import not_drawn, replay
+from mjx_refine.report.diagnosis_replay import replay
 from mjx_refine.report.diagnosis_tables import candidate_rows, gap_tiles, percent, width
 from mjx_refine.report.page import duration
 from mjx_refine.search.result import Replay
 
+_HERE = Path(__file__).parent
 FRAMES = 6
 _FRAME_SIDE, _LEAST_SIDE = 640, 480  # px
 
@@ -38,22 +39,23 @@ def diagnosis_page(
       call: what was asked for; ``init``, ``video``, ``seed``, ``without`` are shown.
     """
     environment = _environment()
-    style = house_style(environment)
-    changed = diagnosis.scene != diagnosis.base
+    added = [effect.effect for effect in diagnosis.scene.effects if effect not in diagnosis.base.effects]
+    changed = bool(added)
+    label = "with " + " and ".join(added) if changed else ""
     map_panels = [Rows("base model, refitted", diagnosis.map_before)]
     if changed:
-        map_panels.append(Rows(f"with {', '.join(diagnosis.verdict.effects)}", diagnosis.map_after))
+        map_panels.append(Rows(label, diagnosis.map_after))
     maps = [panel.misfit for panel in map_panels]
     present = {int(k) for k in np.unique(diagnosis.channels[(diagnosis.map_before > 1) | (diagnosis.map_after > 1)])}
     return environment.get_template("diagnosis.html").render(
-        style=style,
+        style=house_style(),
         source=_source(observation, call),
         verdict=diagnosis.verdict,
         named=diagnosis.verdict.effects not in (NONE, UNKNOWN),
         groups=diagnosis.verdict.indistinguishable,
         gap=diagnosis.gap,
         tiles=gap_tiles(diagnosis.gap, changed),
-        bars=gap_bars(diagnosis.gap, "with " + ", ".join(diagnosis.verdict.effects) if changed else "diagnosed"),
+        bars=gap_bars(diagnosis.gap, label),
         map=misfit_map(diagnosis.base.names, map_panels, diagnosis.channels),
         channels=[(name, CHANNEL_COLOURS[name]) for k, name in enumerate(CHANNELS) if k in present],
         top=top_of(*maps),
@@ -70,10 +72,9 @@ def diagnosis_page(
     )
 
 
-def house_style(environment: jinja2.Environment) -> Markup:
+def house_style() -> Markup:
     """The style sheet of the refinement's report, so that both pages look of one house."""
-    assert environment.loader is not None
-    source, _, _ = environment.loader.get_source(environment, "template.html")
+    source = (_HERE / "template.html").read_text(encoding="utf-8")
     found = re.search(r"<style>(.*?)</style>", source, re.DOTALL)
     if found is None:
         raise ValueError("template.html has no <style>; expected one to share")
@@ -82,7 +83,7 @@ def house_style(environment: jinja2.Environment) -> Markup:
 
 def _environment() -> jinja2.Environment:
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        loader=jinja2.FileSystemLoader(_HERE),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -140,15 +141,14 @@ class FramePair:
 
 def _pictures(diagnosis: Diagnosis, observation: Observation | None, changed: bool) -> dict[str, Any]:
     """What the template needs of the two scenes' pictures; nothing where there is no clip or they cannot be simulated."""
-    nothing: dict[str, Any] = {"frames": [], "plots": [], "undrawn": (), "filmed": True}
+    nothing: dict[str, Any] = {"frames": [], "plots": [], "lost": None, "filmed": True, "failed": ""}
     if observation is None:
         return nothing
     try:
         before = replay(diagnosis.base, observation, diagnosis.matching)
         after = replay(diagnosis.scene, observation, diagnosis.matching) if changed else before
-    except InputError:
-        return nothing
-    undrawn = not_drawn(diagnosis.scene)
+    except InputError as error:
+        return {**nothing, "failed": str(error)}
     curves = []
     if changed:
         pair = before.scores.frame_iou[0], after.scores.frame_iou[0]
@@ -158,9 +158,16 @@ def _pictures(diagnosis: Diagnosis, observation: Observation | None, changed: bo
     return {
         "frames": _frames(diagnosis, observation, before, after if changed else None),
         "plots": curves,
-        "undrawn": undrawn,
+        "lost": _diverges(before, after),
         "filmed": observation.frames is not None,
+        "failed": "",
     }
+
+
+def _diverges(*replays: Replay) -> int | None:
+    """The first frame in which a simulation diverges, or None."""
+    bad = np.array([~np.isfinite(one.poses).all((1, 2)) for one in replays]).any(0)
+    return int(bad.argmax()) if bad.any() else None
 
 
 def shown_frames(misfit: np.ndarray, length: int) -> tuple[list[int], int | None]:

@@ -115,7 +115,9 @@ def _axis(frames: int, y: float) -> list[Markup]:
     """Numbers of frames under the cells' middles."""
     width = (_WIDTH - _LEFT - _RIGHT) / frames
     step = next((s for s in (1, 2, 5, 10, 20, 50, 100, 200, 500) if s * width >= 34), 1000)
-    ticks = [_text(_LEFT + (t + 0.5) * width, y + 12, str(t), anchor="middle", soft=True) for t in range(0, frames, step)]
+    ticks = [
+        _text(_LEFT + (t + 0.5) * width, y + 12, str(t), anchor="middle", soft=True) for t in range(0, frames, step)
+    ]
     return [_text(_LEFT - 10, y + 12, "frame", anchor="end", soft=True), *ticks]
 
 
@@ -124,28 +126,30 @@ def gap_bars(gap: Gap, label: str) -> Markup:
 
     Args:
       gap: what to draw.
-      label: of the second bar.
+      label: of the second bar; empty: the diagnosed scene is the base model's.
     """
-    values = (gap.before, gap.after)
+    bars = [(gap.before, "base model", BEFORE), *([(gap.after, label, AFTER)] if label else [])]
+    values = [value for value, _, _ in bars]
     if not all(math.isfinite(v) for v in values) or max(values) <= 0:
         return Markup("")
-    left, right, bar = 150.0, 70.0, 22.0
+    left, right, bar = 168.0, 62.0, 22.0
+    foot = 6 + len(bars) * (bar + 8)
     scale = (_WIDTH / 2 - left - right) / max(*values, gap.noise_floor if math.isfinite(gap.noise_floor) else 0.0)
     parts: list[Markup] = [
-        Markup('<svg role="img" aria-label="The gap before and after" viewBox="0 0 {:g} 92" font-size="13" '
-               'fill="currentColor">').format(_WIDTH / 2)
+        Markup('<svg role="img" aria-label="The gap before and after" viewBox="0 0 {:g} {:g}" font-size="13" '
+               'fill="currentColor">').format(_WIDTH / 2, foot + 26)
     ]  # fmt: skip
-    for k, (value, name, shade) in enumerate(zip(values, ("base model", label), (BEFORE, AFTER), strict=True)):
+    for k, (value, name, shade) in enumerate(bars):
         y = 4 + k * (bar + 8)
-        parts.append(_text(left - 10, y + 0.7 * bar, _short(name, 20), anchor="end"))
+        parts.append(_text(left - 10, y + 0.7 * bar, _short(name, 21), anchor="end"))
         rect = Markup('<rect x="{:g}" y="{:g}" width="{:.2f}" height="{:g}" rx="3" fill="{}"/>')
         parts.append(rect.format(left, y, max(1.5, value * scale), bar, shade))
         parts.append(_text(left + max(1.5, value * scale) + 7, y + 0.7 * bar, number(value, 3)))
     if math.isfinite(gap.noise_floor):
         x = left + gap.noise_floor * scale
-        line = Markup('<path d="M{:.2f} 0V66" stroke="currentColor" stroke-width="1.5" stroke-dasharray="4 3"/>')
-        parts.append(line.format(x))
-        parts.append(_text(x, 82, f"noise floor {number(gap.noise_floor, 3)}", anchor="middle", soft=True))
+        line = Markup('<path d="M{:.2f} 0V{:g}" stroke="currentColor" stroke-width="1.5" stroke-dasharray="4 3"/>')
+        parts.append(line.format(x, foot))
+        parts.append(_text(x, foot + 16, f"noise floor {number(gap.noise_floor, 3)}", anchor="middle", soft=True))
     return Markup("").join([*parts, Markup("</svg>")])
 
 
