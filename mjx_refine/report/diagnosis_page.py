@@ -12,7 +12,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from mjx_refine.diagnosis.result import CHANNELS, NONE, UNKNOWN, Diagnosis
+from mjx_refine.diagnosis.result import CHANNELS, UNKNOWN, Diagnosis
 from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation
 from mjx_refine.report import encode, plots, tables
@@ -51,7 +51,7 @@ def diagnosis_page(
         style=house_style(),
         source=_source(observation, call),
         verdict=diagnosis.verdict,
-        named=diagnosis.verdict.effects not in (NONE, UNKNOWN),
+        unknown=diagnosis.verdict.effects == UNKNOWN,
         groups=diagnosis.verdict.indistinguishable,
         gap=diagnosis.gap,
         tiles=gap_tiles(diagnosis.gap, changed),

@@ -284,6 +284,14 @@ def test_a_page_where_nothing_is_missing(clip):
     assert page.tags.count("img") == 6
 
 
+def test_an_unknown_effect_is_marked():
+    one = nothing_found()
+    unknown = dataclasses.replace(one, verdict=dataclasses.replace(one.verdict, effects=("unknown",)))
+    assert '<div class="verdict open">' in diagnosis_page(unknown)
+    assert '<div class="verdict open">' not in diagnosis_page(one)
+    assert "with unknown" not in diagnosis_page(unknown)
+
+
 def test_a_page_without_a_clip():
     page = Page(diagnosis_page(made_up(), None, {"poses": "measured.npz"}))
     assert page.text.startswith("Diagnosis: measured.npz")
