@@ -1,0 +1,6 @@
+"""Diagnosis: where a simulation and a clip part, which unmodelled effect parts them, and how far it closes the gap."""
+
+from mjx_refine.diagnosis.diagnose import diagnose
+from mjx_refine.diagnosis.result import CHANNELS, Diagnosis, Gap, Place, Ranked, Value, Verdict
+
+__all__ = ["CHANNELS", "Diagnosis", "Gap", "Place", "Ranked", "Value", "Verdict", "diagnose"]

@@ -85,4 +85,3 @@ def fit_base(clip: ClipFit, space: Space, observation: Observation, masks_of: tu
         if clip.misfit(min(fits, key=lambda fit: fit.cost)) < GOOD:
             break
     return min(fits, key=lambda fit: fit.cost)
-

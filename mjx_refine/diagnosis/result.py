@@ -133,6 +133,7 @@ class Diagnosis:
       map_after: ditto with the verdict's effects.
       channels: channel of each object's and frame's misfit, index into ``CHANNELS``.
       notes: what a reader should know.
+      signs: the numbers that the probabilities were read from.
       seconds: how long it took.
       rollouts: how many were simulated.
     """
@@ -150,6 +151,7 @@ class Diagnosis:
     map_after: Float[np.ndarray, "objects frames"]
     channels: np.ndarray
     notes: tuple[str, ...]
+    signs: dict[str, float]
     seconds: float
     rollouts: int
 

@@ -25,6 +25,12 @@ from mjx_refine.view.tiles import foreground
 FAMILIES = 7
 """Families (effect and target) that are fitted in full, the most promising first."""
 
+FRESH = 6
+"""Ditto that are fitted from the given scene as well."""
+
+FORGIVING = 40.0
+"""Scale of the robust loss while a fit is far off [noise widths]."""
+
 PROMISE = 2.0
 """Evidence that the linear look must promise for a family to be fitted."""
 
@@ -110,13 +116,20 @@ def _singles(
     clip: ClipFit, base: Fit, names, scene, observation, masks_of, told: Told
 ) -> tuple[Fit, tuple[Candidate, ...]]:
     fitted: dict[tuple[str, int], tuple[Fit, float]] = {}
+    zero = clip.at(base.hypothesis, np.zeros(base.hypothesis.dimension), scale=FORGIVING)
     for again in range(2):
-        view = view_of(clip, base, observation, masks_of)
         told("looking ahead")
-        leads = Screen(clip, base, view).leads(names)
-        for lead in _chosen(leads, FAMILIES if again == 0 else 3):
+        view = view_of(clip, base, observation, masks_of)
+        chosen = _chosen(Screen(clip, base, view).leads(names), FAMILIES if again == 0 else 3)
+        for lead in chosen:
             told(f"{lead.name} {_target_name(scene, lead.target)}".strip())
             _fit_lead(clip, base, lead, fitted)
+        if again == 0:
+            # The base model's fit has bent its parameters towards the effect; from the given scene the way is straight.
+            given = Screen(clip, zero, view_of(clip, zero, observation, masks_of), FORGIVING).leads(names)
+            for lead in _chosen(given, FRESH, 1):
+                told(f"{lead.name} {_target_name(scene, lead.target)}".strip())
+                _fit_lead(clip, zero, lead, fitted)
         _walls_from_pushes(clip, base, fitted, names, view, told)
         best = max((fit for fit, _ in fitted.values()), key=lambda fit: fit.evidence, default=base)
         # What an effect's fit found for the base parameters may serve the base model as well.
@@ -138,21 +151,25 @@ def _polished(clip: ClipFit, candidate: Candidate, base: Fit) -> Candidate:
     return dataclasses.replace(candidate, fit=fit, lead=fit.evidence - base.evidence)
 
 
-def _chosen(leads: list[Lead], families: int) -> list[Lead]:
-    """The best starts of the best families: two where place or moment matter, else one."""
+def _chosen(leads: list[Lead], families: int, starts: int = 2) -> list[Lead]:
+    """The best starts of the best families: several where place or moment matter, else one."""
     kept: dict[tuple[str, int], list[Lead]] = {}
     for lead in leads:
         family = kept.setdefault((lead.name, lead.target), [])
-        if len(family) < (2 if lead.start.places > 1 else 1):
+        if len(family) < (starts if lead.start.places > 1 else 1):
             family.append(lead)
     best = [family for family in kept.values() if family[0].gain > PROMISE][:families]
     return [lead for family in best for lead in family]
 
 
-def _fit_lead(clip: ClipFit, base: Fit, lead: Lead, fitted: dict) -> None:
+def _fit_lead(clip: ClipFit, here: Fit, lead: Lead, fitted: dict) -> None:
+    """Fits a lead from where it was seen, and keeps it where it is the family's best."""
     one = lead.term(clip.frames)
-    hypothesis = base.hypothesis.added(one)
-    fit = clip.fit(hypothesis, _begin(clip, hypothesis, base, lead, lead.z(one)), 9)
+    hypothesis = here.hypothesis.added(one)
+    z = _begin(clip, hypothesis, here, lead, lead.z(one))
+    if not here.z.any():
+        z = clip.fit(hypothesis, z, 7, scale=FORGIVING).z
+    fit = clip.fit(hypothesis, z, 9)
     key = (lead.name, lead.target)
     if key not in fitted or fit.evidence > fitted[key][0].evidence:
         fitted[key] = (fit, lead.gain)
@@ -180,7 +197,9 @@ def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: dict, names, view: FitV
         there = dataclasses.replace(view, poses=poses)
         start = HiddenObstacle().facing(there, target, frame, float(np.degrees(np.arctan2(y, x))))
         told("hidden_obstacle")
-        lead = Lead("hidden_obstacle", target, dataclasses.replace(start, places=clip.frames), promise, np.zeros(0), base.z * 0)
+        lead = Lead(
+            "hidden_obstacle", target, dataclasses.replace(start, places=clip.frames), promise, np.zeros(0), base.z * 0
+        )
         one = term_of(lead.name, target, lead.start, clip.frames)
         z = np.concatenate([fit.z[: base.hypothesis.dimension], np.zeros(int(one.free.sum()))])
         wall = clip.fit(base.hypothesis.added(one), z, 9)
@@ -226,7 +245,11 @@ def view_of(clip: ClipFit, fit: Fit, observation: Observation, masks_of: tuple[i
     spin = spins(poses, fps)
     spin = np.concatenate([spin, spin[-1:]]) if len(spin) else np.zeros_like(velocity)
     lowest = np.stack(
-        [np.broadcast_to(lowest_extent(s, batch.size[0, n][None], poses[:, n, 3:]), len(poses)) for n, s in enumerate(batch.shapes)], 1
+        [
+            np.broadcast_to(lowest_extent(s, batch.size[0, n][None], poses[:, n, 3:]), len(poses))
+            for n, s in enumerate(batch.shapes)
+        ],
+        1,
     )
     on_floor = poses[..., 2] - lowest < 0.01
     plain = dataclasses.replace(batch, effects=())

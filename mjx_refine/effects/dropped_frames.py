@@ -28,3 +28,11 @@ class DroppedFrames(EffectKind):
     def starts(self, view: FitView, target: int) -> list[Start]:
         found = [np.array([f, c], float) for f in range(1, view.frames) for c in (1, 2, 3, 4, 5, -1, -2, -3, -4, -5)]
         return [Start(v, fixed=(0, 1), places=len(found)) for v in found]
+
+    def window(self, view: FitView, target: int, values: np.ndarray) -> tuple[int, int] | None:
+        first = int(np.clip(values[0], 1, view.frames - 1))
+        doubled = int(max(-values[1], 0))
+        return first - 1, min(first + doubled, view.frames - 1)
+
+    def struck(self, view: FitView, values: np.ndarray) -> int:
+        return int(np.linalg.norm(view.velocity, axis=-1).mean(0).argmax())

@@ -43,3 +43,15 @@ class FrictionPatch(EffectKind):
                         found.append(np.array([*centre, wide * radius, friction]))
         width = [np.array([0.5 * v[2], 0.5 * v[2], 0.4 * v[2], 0.4]) for v in found]
         return [Start(v, width=w, places=max(len(found), 1)) for v, w in zip(found, width, strict=True)]
+
+    def window(self, view: FitView, target: int, values: np.ndarray) -> tuple[int, int] | None:
+        inside = self._inside(view, values)[:, self.struck(view, values)]
+        frames = np.nonzero(inside)[0]
+        return (int(frames[0]), int(frames[-1])) if len(frames) else None
+
+    def struck(self, view: FitView, values: np.ndarray) -> int:
+        return int(self._inside(view, values).sum(0).argmax())
+
+    def _inside(self, view: FitView, values: np.ndarray) -> np.ndarray:
+        moving = np.linalg.norm(view.velocity, axis=-1) > 0.03
+        return (np.linalg.norm(view.poses[..., :2] - values[:2], axis=-1) < values[2]) & view.on_floor & moving

@@ -216,6 +216,14 @@ class EffectKind:
         """Where to begin; by default where the effect does nothing, looking ahead along every parameter."""
         return [self.still(view, target)]
 
+    def window(self, view: FitView, target: int, values: np.ndarray) -> tuple[int, int] | None:
+        """First and last frame in which it acts; None: wherever the target moves."""
+        return None
+
+    def struck(self, view: FitView, values: np.ndarray) -> int:
+        """Index of the object that an effect without a target acts on most, or -1."""
+        return 0 if len(view.batch.shapes) == 1 and self.channel not in ("camera", "timing") else -1
+
     def widths(self, view: FitView, target: int) -> np.ndarray:
         """Prior standard deviations for this scene."""
         return np.array([p.width for p in self.spread(view.frames)])

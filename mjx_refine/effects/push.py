@@ -44,3 +44,7 @@ class Push(EffectKind):
         width = np.array([0.7 / view.fps, mass, mass, mass])
         columns = tuple((k, 0.2 * mass) for k in (1, 2, 3))
         return [Start(np.array([t, 0.0, 0.0, 0.0]), columns, width, places=len(onsets)) for t in onsets]
+
+    def window(self, view: FitView, target: int, values: np.ndarray) -> tuple[int, int] | None:
+        first = int(np.clip(np.floor(values[0] * view.fps), 0, view.frames - 1))
+        return first, min(first + 1, view.frames - 1)

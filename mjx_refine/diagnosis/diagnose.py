@@ -1,0 +1,287 @@
+"""The diagnosis of one clip, from scene and observation to the answer."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.heldout import HeldOut, held_out
+from mjx_refine.diagnosis.measure import measure
+from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Value, Verdict
+from mjx_refine.diagnosis.search import Candidate, Compared, compare, view_of
+from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, map_of, signs
+from mjx_refine.diagnosis.where import describe, misfit_map, places
+from mjx_refine.errors import InputError
+from mjx_refine.observation import Observation
+from mjx_refine.scene import Samples, Scene
+from mjx_refine.search.options import Options
+from mjx_refine.search.problem import Problem
+
+LEAST_FRAMES = 9
+"""Frames that a clip must have: fewer cannot be held out."""
+
+LEAST_IOU = 0.05
+"""Overlap below which the scene is not this clip's."""
+
+LEAST_MOTION = 1.0
+"""How far something must move [px]."""
+
+TOLD_APART = 0.15
+"""Share of the named effects' probability from which an effect is not told apart from the likeliest."""
+
+
+def diagnose(
+    scene: Scene,
+    observation: Observation,
+    *,
+    without: tuple[str, ...] = (),
+    seed: int = 0,
+    threads: int | None = None,
+    told: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Says where a refined scene and its clip part, which effect parts them, and how far it closes the gap.
+
+    Args:
+      scene: refined, without effects.
+      observation: its clip.
+      without: effects to leave out of the catalogue.
+      seed: of everything random.
+      threads: of the simulator; all cores by default.
+      told: called with a line for each step.
+
+    Raises:
+      InputError: the scene has effects, does not match the clip, nothing moves, or the clip is too short.
+    """
+    began = time.monotonic()
+    _check(scene, observation)
+    told = told or (lambda line: None)
+    problem = Problem(Samples("<scene>", (scene,), (0,)), observation, Options(threads=threads))
+    start = problem.starts[0]
+    if float(start.scores.iou[0]) < LEAST_IOU:
+        raise InputError(
+            f"{observation.source}: the scene overlaps the clip with an IoU of {float(start.scores.iou[0]):.3f}; expected a "
+            "refined scene of this clip; run `refine --init ... --video ...` first"
+        )
+    measured = measure(observation, problem.columns(start.matching))
+    _check_motion(measured.reach, observation)
+    clip = ClipFit(problem.reference(scene.shapes), measured, observation.size, observation.length)
+    compared = compare(clip, start.scene, observation, start.matching, without, seed, told)
+    told("held-out frames")
+    best = best_candidate(compared)
+    outside = held_out(clip, compared.base, best.fit if best else None)
+    found = signs(clip, compared, outside.gain)
+    leads = [c.lead for c in compared.candidates]
+    said = answer(found, leads, found.after)
+    told("report")
+    return _result(clip, compared, outside, found, said, problem, observation, start.matching, seed, began)
+
+
+def _check(scene: Scene, observation: Observation) -> None:
+    if scene.effects:
+        raise InputError(
+            f"scene: it has an effect already ({scene.effects[0].effect}); a diagnosis starts from the base model; remove "
+            "the entries of type effect"
+        )
+    if observation.length < LEAST_FRAMES:
+        raise InputError(
+            f"{observation.source}: cannot tell from {observation.length} frames; expected at least {LEAST_FRAMES}, so that "
+            "some can be held out; give a longer clip"
+        )
+
+
+def _check_motion(reach: np.ndarray, observation: Observation) -> None:
+    if not np.isfinite(reach).any():
+        raise InputError(
+            f"{observation.source}: cannot tell: no object has a mask that can be measured; check the masks"
+        )
+    with np.errstate(all="ignore"):
+        spans = np.nanmax(reach, 0) - np.nanmin(reach, 0)
+    if not float(np.nanmax(spans)) > LEAST_MOTION:
+        raise InputError(
+            f"{observation.source}: cannot tell: nothing moves by more than {LEAST_MOTION:g} px; film a motion"
+        )
+
+
+# --- the answer -------------------------------------------------------------------------------------------------------
+
+
+def _verdict(compared: Compared, said: Answer, names: tuple[str, ...], shapes) -> tuple[Verdict, Candidate | None]:
+    """The likeliest answer, and the hypothesis behind it."""
+    singles = compared.candidates
+    by_name: dict[str, float] = {}
+    for c, share in zip(singles, said.shares, strict=True):
+        by_name[c.names[0]] = by_name.get(c.names[0], 0.0) + share
+    top = max(by_name, key=lambda name: by_name[name], default="")
+    single = said.named * (1 - said.pair) * by_name.get(top, 0.0)
+    double = said.named * said.pair
+    pairs = [c for c in compared.pairs if c.lead > 0]
+    options = {"none": said.none, "unknown": said.unknown, "single": single, "pair": double if pairs else 0.0}
+    chosen = max(options, key=lambda key: options[key])
+    probability = options[chosen]
+    if chosen == "none":
+        return Verdict((), probability, (), "Nothing is missing: the base model explains the clip to the noise.",
+                       "Nothing more is needed; a longer or faster motion would show smaller effects."), None  # fmt: skip
+    if chosen == "unknown":
+        text = "Something is missing that no effect of the catalogue explains."
+        return Verdict(
+            UNKNOWN, probability, (), text, "Film the same motion again: does the misfit come back the same?"
+        ), None
+    best = pairs[0] if chosen == "pair" else next(c for c in singles if c.names[0] == top)
+    group = [name for name, share in sorted(by_name.items(), key=lambda kv: -kv[1]) if share > TOLD_APART]
+    alike = (tuple(group),) if len(group) > 1 and chosen == "single" else ()
+    words = []
+    for t in best.fit.hypothesis.terms:
+        name = names[t.target] if t.target >= 0 else ""
+        words.append(t.kind.sentence.format(target=name, shape=shapes[t.target] if t.target >= 0 else ""))
+    text = "; and ".join(words)
+    text = text[0].upper() + text[1:] + "."
+    if alike:
+        text += f" This clip cannot tell {', '.join(alike[0])} apart."
+    first = best.fit.hypothesis.terms[0]
+    experiment = first.kind.experiment.format(target=names[first.target] if first.target >= 0 else "the object")
+    return Verdict(best.names, probability, alike, text, experiment), best
+
+
+def _result(
+    clip, compared, outside: HeldOut, found: Signs, said: Answer, problem, observation, matching, seed, began
+) -> Diagnosis:
+    base = compared.base
+    names, shapes = base.hypothesis.space.scene.names, base.hypothesis.space.scene.shapes
+    verdict, best = _verdict(compared, said, names, shapes)
+    shown = best.fit if best else base
+    overall = best_candidate(compared)
+    if best is not None and (overall is None or best is not overall):
+        outside = held_out(clip, base, best.fit)
+    if best is None:
+        outside = dataclasses.replace(outside, after=outside.before)
+    before_scene = base.hypothesis.scene(base.z, clip.frames)
+    after_scene = shown.hypothesis.scene(shown.z, clip.frames)
+    scores = [problem.score([s], matching) for s in (before_scene, after_scene)]
+    view = view_of(clip, shown, observation, matching)
+    channels = misfit_map(clip, base)[1]
+    gap = _gap(outside, scores, seed)
+    return Diagnosis(
+        verdict=verdict,
+        gap=gap,
+        where=places(clip, base, best.fit if best else None, view),
+        candidates=tuple(_ranked(clip, compared, said, outside, best)),
+        residual=describe(clip, base, view_of(clip, base, observation, matching)),
+        remaining=describe(clip, shown, view),
+        base=before_scene,
+        scene=after_scene,
+        matching=matching,
+        map_before=map_of(clip, base),
+        map_after=map_of(clip, shown),
+        channels=channels,
+        notes=_notes(clip, compared, matching, names),
+        signs=dataclasses.asdict(found),
+        seconds=time.monotonic() - began,
+        rollouts=int(clip.rollouts),
+    )
+
+
+def _gap(outside: HeldOut, scores, seed: int) -> Gap:
+    before, after = (float(np.sqrt(np.mean(v**2))) for v in (outside.before, outside.after))
+    low, high = outside.interval(seed)
+    iou = [float(s.iou[0]) for s in scores]
+    epe = [float(s.epe[0]) for s in scores]
+    return Gap(
+        metric="outlines, flow and background against the clip, root mean square over held-out frames, in widths of the noise",
+        held_out="every third block of three frames",
+        before=before,
+        after=after,
+        noise_floor=outside.floor,
+        closed=outside.closed,
+        closed_low=low,
+        closed_high=high,
+        iou_before=iou[0],
+        iou_after=iou[1],
+        epe_before=epe[0],
+        epe_after=epe[1],
+    )
+
+
+def _ranked(clip: ClipFit, compared: Compared, said: Answer, outside: HeldOut, best: Candidate | None) -> list[Ranked]:
+    """Every fitted effect, the likeliest first; of two at work, both with the parameters of their common fit."""
+    names, shapes = compared.base.hypothesis.space.scene.names, compared.base.hypothesis.space.scene.shapes
+    rows: list[Ranked] = []
+    base_rms, floor = _rms(clip, compared.base), outside.floor
+
+    def row(candidate: Candidate, k: int, probability: float) -> Ranked:
+        t = candidate.fit.hypothesis.terms[k]
+        target = names[t.target] if t.target >= 0 else None
+        if candidate is best:
+            after, closed = float(np.sqrt(np.mean(outside.after**2))), outside.closed
+        else:
+            after = _rms(clip, candidate.fit)
+            closed = float(np.clip((base_rms - after) / max(base_rms - min(floor, after), 1e-6), -1.0, 1.0))
+        sentence = t.kind.sentence.format(target=target or "", shape=shapes[t.target] if t.target >= 0 else "")
+        return Ranked(
+            t.name, target, probability, candidate.lead, _values(clip, candidate.fit, k), after, closed, sentence
+        )
+
+    pair = best is not None and len(best.names) > 1
+    if pair and best is not None:
+        rows += [row(best, k, said.named * said.pair) for k in range(len(best.names))]
+    told = {(r.effect, r.target) for r in rows}
+    for candidate, share in zip(compared.candidates, said.shares, strict=True):
+        one = row(candidate, 0, said.named * (1 - said.pair) * share)
+        if (one.effect, one.target) not in told:
+            rows.append(one)
+    return (
+        rows[:2] + sorted(rows[2:], key=lambda r: -r.probability)
+        if pair
+        else sorted(rows, key=lambda r: -r.probability)
+    )
+
+
+def _rms(clip: ClipFit, fit: Fit) -> float:
+    return float(np.sqrt(clip.misfit(fit)))
+
+
+def _values(clip: ClipFit, fit: Fit, k: int) -> dict[str, Value]:
+    """Parameters with 90 % intervals from the curvature, widened where the fit leaves more than noise."""
+    hypothesis = fit.hypothesis
+    t = hypothesis.terms[k]
+    covariance = np.linalg.inv(fit.curvature) * max(1.0, clip.misfit(fit))
+    first = hypothesis.space.dimension + sum(int(o.free.sum()) for o in hypothesis.terms[:k])
+    deviation = np.zeros(len(t.centre))
+    deviation[t.free] = np.sqrt(np.diag(covariance))[first : first + int(t.free.sum())] * t.width[t.free]
+    values = hypothesis.values(fit.z[None], k)[0]
+    result: dict[str, Value] = {}
+    at = 0
+    for p in t.kind.parameters:
+        count = 1 if p.length == 0 else (clip.frames if p.length < 0 else p.length)
+        part, wide = values[at : at + count], 1.645 * deviation[at : at + count]
+        at += count
+        if p.length == 0:
+            low, high = max(float(part[0] - wide[0]), p.low), min(float(part[0] + wide[0]), p.high)
+            result[p.name] = Value(float(part[0]), low, high, p.unit)
+        else:
+            centred = part - part.mean() if p.length < 0 else part
+            size = float(np.sqrt(np.mean(centred**2)))
+            error = float(np.sqrt(np.mean(wide**2)))
+            result[f"{p.name}_rms"] = Value(size, max(size - error, 0.0), size + error, p.unit)
+    if t.name == "camera_shake":
+        halves = values.reshape(2, -1)
+        size = float(np.sqrt(np.mean((halves - halves.mean(1, keepdims=True)) ** 2)))
+        result["amplitude"] = Value(size, 0.9 * size, 1.1 * size, "degree")
+    return result
+
+
+def _notes(clip: ClipFit, compared: Compared, matching, names) -> tuple[str, ...]:
+    notes = []
+    lost = [n for n, i in zip(names, matching, strict=True) if i < 0]
+    if lost:
+        notes.append(f"No mask belongs to {', '.join(lost)}: nothing is known of it.")
+    if clip.misfit(compared.base) > 10 and best_candidate(compared) is None:
+        notes.append("The base model's fit is far off; a better starting scene may change the answer.")
+    if compared.impacts:
+        notes.append(
+            f"{compared.impacts} impacts may each err by 8 % of their change of velocity before anything else is blamed."
+        )
+    return tuple(notes)

@@ -1,0 +1,101 @@
+"""The gap on frames that no fit has seen."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mjx_refine.diagnosis.fit import ClipFit, Fit
+
+BLOCK = 3
+"""Frames in a block; every third block is held out."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HeldOut:
+    """What the base model and another hypothesis leave on held-out frames.
+
+    Attributes:
+      before: root mean square residual of the base model [noise widths], by held-out frame.
+      after: ditto by the other.
+      floor: ditto by noise alone.
+      gain: evidence that the other gains there [natural logarithms].
+    """
+
+    before: Float[np.ndarray, "held"]
+    after: Float[np.ndarray, "held"]
+    floor: float
+    gain: float
+
+    @property
+    def closed(self) -> float:
+        """(before - after) / (before - floor)."""
+        return _closed(self.before, self.after, self.floor)
+
+    def interval(self, seed: int) -> tuple[float, float]:
+        """90 % bootstrap interval of ``closed`` over blocks of frames (Kuensch 1989)."""
+        generator = np.random.default_rng(seed)
+        blocks = np.array_split(np.arange(len(self.before)), max(len(self.before) // BLOCK, 1))
+        draws = []
+        for _ in range(400):
+            chosen = np.concatenate([blocks[k] for k in generator.integers(0, len(blocks), len(blocks))])
+            draws.append(_closed(self.before[chosen], self.after[chosen], self.floor))
+        low, high = np.quantile(draws, [0.05, 0.95])
+        return float(low), float(high)
+
+
+def _closed(before: np.ndarray, after: np.ndarray, floor: float) -> float:
+    b, a = (float(np.sqrt(np.mean(v**2))) for v in (before, after))
+    floor = min(floor, a, b)
+    return float(np.clip((b - a) / (b - floor), -1.0, 1.0)) if b - floor > 1e-3 else 0.0
+
+
+def kept_frames(frames: int) -> Bool[np.ndarray, "frames"]:
+    """All frames but every third block of three."""
+    return (np.arange(frames) // BLOCK) % 3 != 2
+
+
+def held_out(clip: ClipFit, base: Fit, other: Fit | None) -> HeldOut:
+    """Fits both on the kept frames, from where they ended on all, and looks at the others."""
+    keep = kept_frames(clip.frames)
+    first = _outside(clip, base, keep)
+    second = first if other is None else _outside(clip, other, keep)
+    seen = [np.isfinite(a).any(tuple(range(1, a.ndim))) for a in (clip.measured.reach,)][0]
+    frames = np.nonzero(~keep & seen)[0]
+    if len(frames) == 0:
+        frames = np.nonzero(~keep)[0]
+    floor = float(np.sqrt(np.mean(_rough(clip, other or base)[frames])))
+    gain = 0.5 * float((first - second).sum()) * clip.expected / max(clip.frames, 1)
+    return HeldOut(np.sqrt(first[frames]), np.sqrt(second[frames]), floor, gain)
+
+
+def _outside(clip: ClipFit, fit: Fit, keep: np.ndarray) -> np.ndarray:
+    """Mean square residual of every frame [noise widths squared], zero in the kept ones."""
+    again = clip.fit(fit.hypothesis, fit.z, 6, keep=keep)
+    batch = again.hypothesis.batch(again.z[None])
+    distances = clip.distances(clip.predictor(clip.poses(again.hypothesis, again.z[None]), batch))
+    return np.where(keep, 0.0, _by_frame(clip, clip.whitened(distances, None, 20.0)[0]))
+
+
+def _by_frame(clip: ClipFit, white: np.ndarray) -> np.ndarray:
+    """Sum of squares of each frame's residuals over what noise alone gives."""
+    m = clip.measured
+    a, b = m.reach.size, m.reach.size + m.flow.size
+    total = (white[:a].reshape(m.reach.shape) ** 2).sum((1, 2))
+    total[:-1] += (white[a:b].reshape(m.flow.shape) ** 2).sum((1, 2, 3))
+    total[:-1] += (white[b:].reshape(m.background.shape) ** 2).sum((1, 2))
+    return total / max(clip.expected / clip.frames, 1e-9)
+
+
+def _rough(clip: ClipFit, fit: Fit) -> np.ndarray:
+    """What of a fit's residuals changes from frame to frame, as noise does: by frame, in the same units."""
+    m, white = clip.measured, fit.residual
+    a, b = m.reach.size, m.reach.size + m.flow.size
+    parts = []
+    for part, shape in ((white[:a], m.reach.shape), (white[a:b], m.flow.shape), (white[b:], m.background.shape)):
+        series = part.reshape(shape)
+        step = np.diff(series, axis=0) / np.sqrt(2.0)
+        parts.append(np.concatenate([step[:1], step]).ravel() if len(step) else part)
+    return _by_frame(clip, np.concatenate(parts))
