@@ -9,14 +9,20 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from mjx_refine import files
-from mjx_refine.batch import batch_from_scenes
+from mjx_refine import files, rotations
+from mjx_refine.batch import SceneBatch
+from mjx_refine.effects import acting, batch_with_effects
+from mjx_refine.effects.hidden_obstacle import damping_of, stiffness_of
+from mjx_refine.effects.wind import mean_shadow
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Camera, Scene
 from mjx_refine.sim.model import SUBSTEPS, contact_pairs, initial_state, model_fields
 
 KEYFRAME = "start"
 """Name of the keyframe that holds the first frame's positions and velocities."""
+
+EXPORTED = ("slope", "offset_com", "camera_roll", "hidden_obstacle", "wind", "drag")
+"""Effects that MuJoCo's XML can hold, the last in part."""
 
 _RESERVED = ("floor", "world")
 _COLOURS = ("0.95 0.75 0.1", "0.1 0.65 0.9", "0.95 0.35 0.6", "0.35 0.8 0.35", "0.95 0.5 0.15", "0.6 0.45 0.95")
@@ -38,22 +44,23 @@ def export_xml(scene: Scene, fps: float = 30.0) -> str:
     Bodies lie at their initial poses (``qpos0``); the keyframe ``start`` adds the initial velocities. The fixed camera
     ``camera`` is the scene's, and the viewer's free camera starts there too.
 
+    Of the effects MuJoCo's own elements hold ``slope``, ``offset_com``, ``camera_roll``, ``wind`` and a linear ``drag``
+    exactly, and ``hidden_obstacle`` as a plane without friction: what else pushes a body while it touches that plane is
+    held off too, and a body that starts far behind it is thrown out.
+
     Args:
-      scene: without effects.
+      scene: with no other effects.
       fps: frames a second; the time step is 1 / (8 fps) [s].
 
     Raises:
-      InputError: the scene has effects, or ``fps`` is no sensible rate.
+      InputError: an effect is wrong or cannot be held, or ``fps`` is no sensible rate.
     """
-    if scene.effects:
-        raise InputError(
-            f"scene: it has an effect ({scene.effects[0].effect}); exporting effects is not possible in this version; "
-            "remove the entries of type effect"
-        )
     if not 0.1 <= fps <= 1e5:
         raise InputError(f"fps = {fps!r}; expected 0.1 <= fps <= 100000 frames a second; correct it")
     names = _element_names(scene.names)
-    batch = batch_from_scenes([scene])
+    batch = batch_with_effects([scene])
+    _check_effects(batch)
+    centre = acting.centre_of_mass(batch)
     fields = model_fields(batch)
     root = ElementTree.Element("mujoco", model="scene")
     root.append(ElementTree.Comment(_COMMENT))
@@ -61,13 +68,13 @@ def export_xml(scene: Scene, fps: float = 30.0) -> str:
     _add(root, "option", timestep=repr(1.0 / (fps * SUBSTEPS)), gravity=_numbers(fields.gravity[0]), **option)
     _looks(root, scene)
     world = _add(root, "worldbody")
-    _surroundings(world, scene.camera)
+    _surroundings(world, scene.camera, batch)
     for i, (name, body) in enumerate(zip(names, scene.objects, strict=True)):
         place = {"pos": _numbers(body.position), "quat": _numbers(body.orientation)}
         element = _add(world, "body", name=name, **place)
         _add(element, "freejoint", name=name)
         inertia = {"mass": repr(float(fields.body_mass[0, i])), "diaginertia": _numbers(fields.body_inertia[0, i])}
-        _add(element, "inertial", pos="0 0 0", **inertia)
+        _add(element, "inertial", pos="0 0 0" if centre is None else _numbers(centre[0, i]), **inertia)
         used = {"sphere": 1, "cylinder": 2, "box": 3}[body.shape]
         shape = {"type": body.shape, "size": _numbers(fields.geom_size[0, i, :used])}
         colour = f"{_COLOURS[i % len(_COLOURS)]} 1"
@@ -82,6 +89,8 @@ def export_xml(scene: Scene, fps: float = 30.0) -> str:
         one = "floor" if first < 0 else names[first]
         texts = {key: _numbers(value) for key, value in numbers.items()}
         _add(contact, "pair", geom1=one, geom2=names[second], condim="6", **texts)
+    _obstacles(world, contact, batch, names, fps)
+    _forces(root, batch, names)
     qpos, qvel = initial_state(batch)
     keys = _add(root, "keyframe")
     _add(keys, "key", name=KEYFRAME, qpos=_numbers(qpos[0]), qvel=_numbers(qvel[0]))
@@ -139,12 +148,80 @@ def _looks(root: ElementTree.Element, scene: Scene) -> None:
     _add(asset, "material", name="floor", **cover)
 
 
-def _surroundings(world: ElementTree.Element, camera: Camera) -> None:
-    """Light, floor and the scene's camera."""
+def _surroundings(world: ElementTree.Element, camera: Camera, batch: SceneBatch) -> None:
+    """Light, floor and the scene's camera, the last two turned as effects turn them."""
     _add(world, "light", pos="-1 -2 6", dir="0.15 0.3 -1", directional="true", diffuse="0.6 0.6 0.6")
     floor = {"type": "plane", "size": "0 0 0.05", "material": "floor", "contype": "0", "conaffinity": "0"}
+    tilt = acting.floor_rotation(batch)
+    if tilt is not None:
+        floor["quat"] = _numbers(acting.quaternion_of(tilt[0]))
     _add(world, "geom", name="floor", **floor)
     half = math.radians(camera.orientation) / 2
-    turn = (math.cos(half), math.sin(half), 0.0, 0.0)
+    turn = np.array([math.cos(half), math.sin(half), 0.0, 0.0])
+    for roll in _of(batch, "camera_roll"):
+        turn = rotations.multiply(turn, rotations.exponential(np.array([0.0, 0.0, math.radians(roll[0])])))
     place = {"pos": _numbers(camera.position), "quat": _numbers(turn), "fovy": repr(camera.fovy)}
     _add(world, "camera", name="camera", mode="fixed", **place)
+
+
+def _of(batch: SceneBatch, name: str) -> list[np.ndarray]:
+    """The parameters of every effect of a kind."""
+    return [effect.values[0] for effect in batch.effects if effect.name == name]
+
+
+def _check_effects(batch: SceneBatch) -> None:
+    for effect in batch.effects:
+        remedy = "remove the entry, or use `refine simulate`, which has it"
+        if effect.name not in EXPORTED:
+            held = ", ".join(EXPORTED)
+            raise InputError(f"effect {effect.name}: MuJoCo's XML cannot hold it (it can: {held}); {remedy}")
+        if effect.name == "drag":
+            linear, quadratic = effect.values[0]
+            # Above that ``Drag`` keeps a step of time from reversing the body.
+            if quadratic != 0 or linear > 100.0 * batch.mass[0, effect.target]:
+                raise InputError(
+                    f"effect drag: MuJoCo's XML holds only its linear part, up to 100 1/s times the mass; {remedy}"
+                )
+
+
+def _obstacles(
+    world: ElementTree.Element, contact: ElementTree.Element, batch: SceneBatch, names: list[str], fps: float
+) -> None:
+    """Walls that one object feels, without friction."""
+    for effect in batch.effects:
+        if effect.name != "hidden_obstacle":
+            continue
+        angle, distance, restitution = effect.values[0]
+        name = "obstacle"
+        while name in names or world.find(f"geom[@name='{name}']") is not None:
+            name += "_"
+        turn = math.radians(angle)
+        normal = np.array([math.cos(turn), math.sin(turn), 0.0])
+        half = math.sqrt(0.5)
+        place = {
+            "pos": _numbers(normal * distance),
+            "quat": _numbers((half, -half * math.sin(turn), half * math.cos(turn), 0.0)),
+        }
+        look = {"size": "1 1 0.05", "rgba": "0.8 0.3 0.3 0.2", "contype": "0", "conaffinity": "0"}
+        _add(world, "geom", name=name, type="plane", **place, **look)
+        # The largest impedance that MuJoCo takes: the contact's acceleration is that of the damped spring.
+        step = 1.0 / (fps * SUBSTEPS)
+        solref = _numbers((-stiffness_of(step), -damping_of(restitution, step)))
+        spring = {"solref": solref, "solimp": "0.9999 0.9999 0.001 0.5 2"}
+        _add(contact, "pair", geom1=name, geom2=names[effect.target], condim="1", **spring)
+
+
+def _forces(root: ElementTree.Element, batch: SceneBatch, names: list[str]) -> None:
+    """Wind and linear drag as motors of the free joints: constant, and proportional to the velocity."""
+    rows: list[tuple[str, int, str]] = []
+    for values in _of(batch, "wind"):
+        for i, name in enumerate(names):
+            rows += [(name, k, _numbers((values[k] * mean_shadow(batch)[0, i], 0.0, 0.0))) for k in range(2)]
+    for effect in batch.effects:
+        if effect.name == "drag":
+            rows += [(names[effect.target], k, _numbers((0.0, 0.0, -effect.values[0, 0]))) for k in range(3)]
+    if rows:
+        motors = _add(root, "actuator")
+        for name, k, bias in rows:
+            gear = _numbers(np.eye(6)[k])
+            _add(motors, "general", joint=name, gear=gear, gainprm="0", biastype="affine", biasprm=bias)

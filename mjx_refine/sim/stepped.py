@@ -10,7 +10,7 @@ from mujoco import rollout
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting
-from mjx_refine.effects.kind import Motion
+from mjx_refine.effects.kind import Loads, Motion
 from mjx_refine.sim.model import SUBSTEPS
 
 
@@ -45,7 +45,7 @@ def stepped_rollout(
     spec = mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
     for k in range((frames - 1) * SUBSTEPS):
         motion = _motion(state, batch, k * step, step, world)
-        told = acting.loads(batch, motion)
+        told = _about_the_mass(acting.loads(batch, motion), motion, acting.centre_of_mass(batch))
         applied[:] = 0.0
         if told is not None:
             for part, load in enumerate(told):
@@ -73,6 +73,14 @@ def stepped_rollout(
     for row, model in enumerate(models):
         model.pair_friction[:objects, :2] = usual[row, :, None]
     return result
+
+
+def _about_the_mass(told: Loads | None, motion: Motion, centre: np.ndarray | None) -> Loads | None:
+    """Loads about the centres of mass, where MuJoCo applies them, from those about the bodies' centres."""
+    if told is None or centre is None:
+        return told
+    force, torque = told
+    return force, torque - np.cross(rotations.rotate(motion.quaternion, centre), force)
 
 
 def _motion(state: np.ndarray, batch: SceneBatch, time: float, step: float, world: np.ndarray | None) -> Motion:

@@ -117,9 +117,9 @@ def test_names_and_comment_are_in_the_file():
     assert "Load key" in export_xml(SCENE)
 
 
-def test_effects_are_refused():
+def test_an_effect_that_xml_cannot_hold_is_refused():
     scene = dataclasses.replace(SCENE, effects=(Effect("drag", "box_0", (("quadratic", 0.1),)),))
-    with pytest.raises(InputError, match="exporting effects is not possible in this version"):
+    with pytest.raises(InputError, match="effect drag: MuJoCo's XML holds only its linear part"):
         export_xml(scene)
 
 

@@ -80,7 +80,7 @@ STARTS = {
 
 def numbers(scene: Scene) -> np.ndarray:
     batch = batch_from_scenes([scene])
-    fields = [f.name for f in dataclasses.fields(batch) if f.name != "shapes"]
+    fields = [f.name for f in dataclasses.fields(batch) if f.name not in ("shapes", "effects")]
     return np.concatenate([getattr(batch, name).reshape(-1) for name in fields])
 
 
@@ -157,7 +157,7 @@ def points_of(space: Space, seed: int, count: int = 20) -> np.ndarray:
 def check_physical(space: Space, u: np.ndarray) -> None:
     batch = space.decode(u)
     for f in dataclasses.fields(batch):
-        if f.name != "shapes":
+        if f.name not in ("shapes", "effects"):
             assert np.isfinite(getattr(batch, f.name)).all(), f.name
     extents = {"sphere": 1, "cylinder": 2, "box": 3}
     for i, shape in enumerate(batch.shapes):
