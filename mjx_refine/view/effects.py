@@ -159,6 +159,8 @@ def render(
     if (part.stop or len(poses)) >= poses.shape[1]:
         flow[:, -1] = 0.0
     shape = (count, -1, len(lines), len(columns))
+    if widened and told.widening is not None:
+        return ids.reshape(shape), render(poses, batch, columns, lines, image, fps, part)[1]
     return ids.reshape(shape), flow.astype(np.float32).reshape(*shape, 2)
 
 
@@ -270,7 +272,9 @@ def _widened(masks: np.ndarray, poses: np.ndarray, one: SceneBatch, size, fps: f
     margin = int(np.ceil(abs(width))) + 2
     part = []
     for index, full in ((lines, size[1]), (columns, size[0])):
-        part.append(slice(max(int(index.min()) - margin, 0), min(int(index.max()) + margin + 1, full)))
+        # In steps of 32 px, so that few sizes are compiled.
+        first, last = (int(index.min()) - margin) // 32 * 32, -(-(int(index.max()) + margin + 1) // 32) * 32
+        part.append(slice(max(first, 0), min(last, full)))
     grids = [np.arange(p.start + 0.5 / FINE, p.stop, 1 / FINE) for p in part]
     result = masks.copy()
     for t in range(len(masks)):

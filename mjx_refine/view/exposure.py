@@ -66,7 +66,7 @@ def straightened(
     A lens that shrinks the picture has a largest radius beyond which no light arrives. To 1e-6 px.
     """
     at = points.copy()
-    determinant = np.ones(points.shape[:2])
+    determinant = trace = np.ones(points.shape[:2])
     step = 0.25
     for _ in range(30):
         wrong = acting.warped(batch, at, focal, image) - points
@@ -75,7 +75,7 @@ def straightened(
             ahead, behind = (acting.warped(batch, at + sign * np.array(axis), focal, image) for sign in (1, -1))
             columns.append((ahead - behind) / (2 * step))
         (a, c), (b, d) = (np.moveaxis(column, -1, 0) for column in columns)
-        determinant = a * d - b * c
+        determinant, trace = a * d - b * c, a + d
         safe = np.where(np.abs(determinant) < 1e-3, 1e-3, determinant)
         move = np.stack([d * wrong[..., 0] - b * wrong[..., 1], a * wrong[..., 1] - c * wrong[..., 0]], -1)
         move = move / safe[..., None]
@@ -84,4 +84,5 @@ def straightened(
         if float(length.max(initial=0.0)) < 1e-7:
             break
     wrong = np.linalg.norm(acting.warped(batch, at, focal, image) - points, axis=-1)
-    return at, (wrong < 1e-4) & (determinant > 0.0)
+    # Where the picture is not turned over, in neither direction.
+    return at, (wrong < 1e-4) & (determinant > 0.0) & (trace > 0.0)
