@@ -13,12 +13,16 @@ from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.slack import Slack, impacts, kicked, slack_of
+from mjx_refine.search.features import DIRECTIONS
 from mjx_refine.search.landing import slowed
 from mjx_refine.sim.backends import Simulator
 
 EDGE_COUNT, FLOW_COUNT, BACKGROUND_COUNT = 6.0, 3.0, 6.0
 """As how many independent numbers the directions of one outline, the flow of one mask (each axis) and that of the
-background (each axis) count in one frame: neighbours err together."""
+background (each axis) count in one frame, since neighbours err together; the first two until they are measured."""
+
+EDGE_COUNTS, FLOW_COUNTS = (4.0, 12.0), (1.5, 10.0)
+"""Bounds of these counts where they are measured."""
 
 STEP, EFFECT_STEP = 0.4, 0.1
 """Of finite differences, in prior widths: of base parameters and of effects'."""
@@ -46,6 +50,9 @@ class Noise:
     flow: Float[np.ndarray, "intervals objects"]
     background: float
 
+
+LEAST_EDGE = 0.12
+"""Noise of outlines that is assumed at least [px]."""
 
 DRAWS = 12
 """Pairs of rollouts that measure chaos."""
@@ -85,6 +92,33 @@ class Fit:
         return self.jacobian.T @ self.jacobian + np.diag(prior(self.hypothesis, self.z)[1] ** 2)
 
 
+def _everywhere(measured: Measured, frames: int) -> Noise:
+    """The same noise in every frame."""
+    return Noise(
+        np.repeat(measured.edge_noise[None], frames, 0),
+        np.repeat(measured.flow_noise[None], frames - 1, 0),
+        measured.background_noise,
+    )
+
+
+def _independent(steps: np.ndarray) -> float:
+    """As how many independent numbers the last axis counts: its length over the sum of its mean correlations."""
+    count = steps.shape[-1]
+    rows = steps.reshape(-1, count)
+    rows = rows[(rows != 0).all(1)]
+    if len(rows) < 10:
+        return float(count) / 3
+    # A few wild rows would speak for all.
+    rows = rows / np.maximum(np.sqrt((rows**2).mean(1, keepdims=True)), 1e-12)
+    return count / max(float((rows.sum(1) ** 2).mean()) / count, 1e-6)
+
+
+def _middle(values: np.ndarray) -> float:
+    """Median of what is finite; one where nothing is."""
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else 0.455
+
+
 def prior(hypothesis: Hypothesis, z: Float[np.ndarray, "*batch dimension"]) -> tuple[np.ndarray, np.ndarray]:
     """The prior as residuals, and their derivatives in z: heavy-tailed for base parameters, normal for effects'."""
     heavy = hypothesis.ordinary
@@ -109,13 +143,10 @@ class ClipFit:
         self, simulator: Simulator, measured: Measured, image: tuple[int, int], frames: int, noise: Noise | None = None
     ):
         self.simulator, self.measured, self.image, self.frames = simulator, measured, image, frames
-        self.noise = noise or Noise(
-            np.repeat(measured.edge_noise[None], frames, 0),
-            np.repeat(measured.flow_noise[None], frames - 1, 0),
-            measured.background_noise,
-        )
+        self.noise = noise or _everywhere(measured, frames)
         self.predictor = Predictor(simulator.shapes, measured.pixels, measured.places, image, simulator.fps)
-        self.rollouts = 0
+        self.rollouts = 0.0
+        self.edge_count, self.flow_count = EDGE_COUNT, FLOW_COUNT
         self._columns: np.ndarray | None = None
         self._slacks: dict[bytes | None, Slack] = {}
 
@@ -144,6 +175,25 @@ class ClipFit:
         columns = self.whitened((parts[0], parts[1], parts[2]), None, 1e9)
         self._columns = columns[~moved.bad].T
         return len(found)
+
+    def settle_noise(self, fit: Fit) -> None:
+        """Sets the noise to what changes from frame to frame in the residuals of a fit, which no smooth misfit does."""
+        m = self.measured
+        a, b = m.reach.size, m.reach.size + m.flow.size
+        reach, flow = fit.residual[:a].reshape(m.reach.shape), fit.residual[a:b].reshape(m.flow.shape)
+
+        def rough(series: np.ndarray, measured: np.ndarray, share: float) -> np.ndarray:
+            step = np.where(np.isfinite(measured), series, np.nan)
+            square = np.diff(step, axis=0) ** 2 / 2 / share
+            return np.array([np.sqrt(_middle(square[:, n]) / 0.455) for n in range(series.shape[1])])
+
+        edge = np.clip(rough(reach, m.reach, self.edge_count / DIRECTIONS), 0.4, 1.5)
+        moved = np.clip(rough(flow, m.flow, self.flow_count / flow.shape[-2]), 0.7, 3.0)
+        self.edge_count = float(np.clip(_independent(np.diff(reach, axis=0)), *EDGE_COUNTS))
+        self.flow_count = float(np.clip(_independent(np.moveaxis(np.diff(flow, axis=0), -1, -2)), *FLOW_COUNTS))
+        edge, moved = m.edge_noise * edge, m.flow_noise * moved
+        self.measured = dataclasses.replace(m, edge_noise=np.maximum(edge, LEAST_EDGE), flow_noise=moved)
+        self.noise = _everywhere(self.measured, self.frames)
 
     def allow_chaos(self, fit: Fit, seed: int) -> None:
         """Adds the rollout's own jaggedness around a fit to the noise.
@@ -203,8 +253,8 @@ class ClipFit:
         noise = self.noise
         parts = []
         for raw, sigma, count in (
-            (reach, noise.edge[:, :, None], EDGE_COUNT / reach.shape[-1]),
-            (flow, noise.flow[:, :, None, None], FLOW_COUNT / flow.shape[-2]),
+            (reach, noise.edge[:, :, None], self.edge_count / reach.shape[-1]),
+            (flow, noise.flow[:, :, None, None], self.flow_count / flow.shape[-2]),
             (background, noise.background, BACKGROUND_COUNT / max(background.shape[-2], 1)),
         ):
             part = slowed(np.nan_to_num(raw) / sigma, scale) * np.sqrt(count)
@@ -215,22 +265,19 @@ class ClipFit:
         slack = self._slack(keep)
         return white if slack is None else slack(white)
 
-    @functools.cached_property
-    def expected(self) -> float:
-        """Sum of squares that noise alone would give."""
+    def expected(self, beside: bool = True) -> float:
+        """Sum of squares that noise alone would give, with the background's or without."""
         m = self.measured
-        total = 0.0
-        for raw, count in (
-            (m.reach, EDGE_COUNT / m.reach.shape[-1]),
-            (m.flow, FLOW_COUNT / m.flow.shape[-2]),
-            (m.background, BACKGROUND_COUNT / max(m.background.shape[-2], 1)),
-        ):
-            total += count * float(np.isfinite(raw).sum())
+        total = self.edge_count / m.reach.shape[-1] * float(np.isfinite(m.reach).sum())
+        total += self.flow_count / m.flow.shape[-2] * float(np.isfinite(m.flow).sum())
+        if beside:
+            total += BACKGROUND_COUNT / max(m.background.shape[-2], 1) * float(np.isfinite(m.background).sum())
         return max(total, 1.0)
 
     def misfit(self, fit: Fit) -> float:
-        """Mean square residual in noise widths."""
-        return 2 * fit.data / self.expected
+        """Mean square residual of the objects in noise widths."""
+        objects = self.measured.reach.size + self.measured.flow.size
+        return float((fit.residual[:objects] ** 2).sum()) / self.expected(beside=False)
 
     def rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
         """The simulator's, counted."""

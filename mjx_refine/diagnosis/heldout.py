@@ -67,7 +67,7 @@ def held_out(clip: ClipFit, base: Fit, other: Fit | None) -> HeldOut:
     if len(frames) == 0:
         frames = np.nonzero(~keep)[0]
     floor = float(np.sqrt(np.mean(_rough(clip, other or base)[frames])))
-    gain = 0.5 * float((first - second).sum()) * clip.expected / max(clip.frames, 1)
+    gain = 0.5 * float((first - second).sum()) * clip.expected() / max(clip.frames, 1)
     return HeldOut(np.sqrt(first[frames]), np.sqrt(second[frames]), floor, gain)
 
 
@@ -86,7 +86,7 @@ def _by_frame(clip: ClipFit, white: np.ndarray) -> np.ndarray:
     total = (white[:a].reshape(m.reach.shape) ** 2).sum((1, 2))
     total[:-1] += (white[a:b].reshape(m.flow.shape) ** 2).sum((1, 2, 3))
     total[:-1] += (white[b:].reshape(m.background.shape) ** 2).sum((1, 2))
-    return total / max(clip.expected / clip.frames, 1e-9)
+    return total / max(clip.expected() / clip.frames, 1e-9)
 
 
 def _rough(clip: ClipFit, fit: Fit) -> np.ndarray:

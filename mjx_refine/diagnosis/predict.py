@@ -15,8 +15,9 @@ from mjx_refine.effects import acting
 from mjx_refine.effects.kind import OutlineView
 from mjx_refine.scene import Shape
 from mjx_refine.search.features import DIRECTIONS
-from mjx_refine.view.outline import Arrays, directions, larger, place, support_of
+from mjx_refine.view.outline import Arrays, directions, place, support_of
 from mjx_refine.view.points import point_flow_function
+from mjx_refine.view.seen import outline_function
 
 SIZES = (8, 128)
 """Batch sizes that are compiled."""
@@ -39,28 +40,6 @@ class Prediction:
     bad: np.ndarray
 
 
-def _outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]):
-    """(reach, contact x, contact y, facing, scale) of every silhouette in every direction."""
-    placed = place(shapes, arrays, image)
-    normals = jnp.asarray(directions(DIRECTIONS), placed.centre.dtype)
-    tangents = jnp.stack([-normals[:, 1], normals[:, 0]], -1)
-    reach, contact, facing, scale = [], [], [], []
-    for n, shape in enumerate(shapes):
-        h, slope = jax.jvp(lambda u, shape=shape, n=n: support_of(shape, placed, n, u), (normals,), (tangents,))
-        # A convex outline's contact point is the gradient of its support function (Schneider, 1.7).
-        point = h[..., None] * normals + slope[..., None] * tangents
-        lean = h / placed.focal
-        outward = jnp.concatenate([jnp.broadcast_to(normals, (*h.shape, 2)), -lean[..., None]], -1)
-        length = jnp.sqrt(1 + lean**2)
-        local = (placed.axes[:, :, n, None] * (outward / length[..., None])[..., :, None]).sum(-2)
-        reach.append(h)
-        contact.append(point + 0.5 * jnp.asarray(image, h.dtype))
-        facing.append(local)
-        scale.append(placed.focal * length / larger(placed.shown[:, :, n, 2], 0.05)[..., None])
-    middle = 0.5 * image[0] * normals[:, 0] + 0.5 * image[1] * normals[:, 1]
-    return jnp.stack(reach, 2) + middle, jnp.stack(contact, 2), jnp.stack(facing, 2), jnp.stack(scale, 2)
-
-
 def _plain_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]):
     placed = place(shapes, arrays, image)
     normals = jnp.asarray(directions(DIRECTIONS), placed.centre.dtype)
@@ -70,7 +49,7 @@ def _plain_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int,
 
 @functools.partial(jax.jit, static_argnums=(0, 3, 4))
 def _predict(shapes, arrays, pixels, image, drawn: bool):
-    told = _outline_function(shapes, arrays, image) if drawn else (_plain_function(shapes, arrays, image),)
+    told = outline_function(shapes, arrays, image, DIRECTIONS) if drawn else (_plain_function(shapes, arrays, image),)
     return told, point_flow_function(shapes, arrays, pixels, image)
 
 

@@ -102,6 +102,7 @@ def compare(
     """
     told("base model")
     base = fit_base(clip, base_space(scene), observation, masks_of)
+    clip.settle_noise(base)
     clip.allow_chaos(base, seed)
     impacts = clip.allow_slack(base)
     base = clip.fit(base.hypothesis, base.z, 10)
@@ -170,6 +171,9 @@ def _fit_lead(clip: ClipFit, here: Fit, lead: Lead, fitted: dict) -> None:
     if not here.z.any():
         z = clip.fit(hypothesis, z, 7, scale=FORGIVING).z
     fit = clip.fit(hypothesis, z, 9)
+    if fit.cost > here.cost and here.z.any():
+        # Where the linear look misleads, the effect grows from nothing.
+        fit = clip.fit(hypothesis, np.concatenate([here.z, 0 * lead.z(one)]), 9)
     key = (lead.name, lead.target)
     if key not in fitted or fit.evidence > fitted[key][0].evidence:
         fitted[key] = (fit, lead.gain)
@@ -266,15 +270,17 @@ def hidden_places(
     drawn, _ = draw(poses, batch, observation.size)
     seen = foreground(observation) > 0
     known = np.isin(drawn, [n + 1 for n, i in enumerate(masks_of) if i >= 0])
-    # A pixel's width of misfit around every outline is no occluder.
-    missing = np.array([ndimage.binary_erosion(d & ~s, iterations=2) for d, s in zip(known, seen, strict=True)])
-    place = ndimage.binary_dilation(missing.any(0), iterations=2) & ~seen.any(0)
-    labels, count = ndimage.label(place)
+    # An outline that is a pixel or two off is no occluder: what is missing must lie well inside of where an object is.
+    missing = np.array([ndimage.binary_erosion(d, iterations=2) & ~s for d, s in zip(known, seen, strict=True)])
+    place = missing.any(0) & ~seen.any(0)
+    place = ndimage.binary_opening(place, iterations=1)
+    labels, count = ndimage.label(ndimage.binary_dilation(place, iterations=2))
     boxes = []
-    for k, box in enumerate(ndimage.find_objects(labels)):
-        area = int((labels[box] == k + 1).sum())
-        if area >= 40:
-            rows, columns = box
-            boxes.append((area, (float(columns.start), float(rows.start), float(columns.stop), float(rows.stop))))
-    del count
+    for k in range(count):
+        rows, columns = np.nonzero((labels == k + 1) & place)
+        if len(rows) < 30:
+            continue
+        left, right = np.quantile(columns, [0.02, 0.98])
+        top, bottom = np.quantile(rows, [0.02, 0.98])
+        boxes.append((len(rows), (float(left) - 2, float(top) - 2, float(right) + 3, float(bottom) + 3)))
     return tuple(box for _, box in sorted(boxes, reverse=True)[:3])

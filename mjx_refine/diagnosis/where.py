@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from mjx_refine.diagnosis.fit import BACKGROUND_COUNT, EDGE_COUNT, FLOW_COUNT, ClipFit, Fit
+from mjx_refine.diagnosis.fit import BACKGROUND_COUNT, ClipFit, Fit
 from mjx_refine.diagnosis.result import CHANNELS, Place
 from mjx_refine.effects.kind import FitView
 from mjx_refine.search.features import DIRECTIONS
@@ -23,9 +23,9 @@ def misfit_map(
     white = _parts(clip, fit)
     reach, flow, background = white
     seen = np.isfinite(m.reach).mean(-1) > 0
-    edges = (reach**2).sum(-1) / EDGE_COUNT
+    edges = (reach**2).sum(-1) / clip.edge_count
     moved = np.zeros_like(edges)
-    moved[:-1] = (flow**2).sum((-1, -2)) / (2 * FLOW_COUNT)
+    moved[:-1] = (flow**2).sum((-1, -2)) / (2 * clip.flow_count)
     total = np.where(seen, 0.6 * edges + 0.4 * moved, 0.0)
     beside = np.zeros(len(reach))
     beside[:-1] = (background**2).sum((-1, -2)) / (2 * BACKGROUND_COUNT)

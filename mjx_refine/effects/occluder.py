@@ -6,7 +6,21 @@ import numpy as np
 
 from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, OutlineView, Start
 
-RINGS = np.linspace(0.0, 1.0, 9)
+
+def _beyond(contact: np.ndarray, normals: np.ndarray, axis: int, sign: float, side: np.ndarray) -> np.ndarray:
+    """Support function of the polygon of ``contact`` points cut at sign * x[axis] > sign * side; -inf where nothing is left.
+
+    The cut polygon's corners are the points on the right side and where edges cross the line.
+    """
+    along = sign * (contact[..., axis] - side)
+    following, there = np.roll(contact, -1, axis=-2), np.roll(along, -1, axis=-1)
+    part = along / np.where(np.abs(along - there) < 1e-9, 1e-9, along - there)
+    crossing = contact + np.clip(part, 0.0, 1.0)[..., None] * (following - contact)
+    most = np.full(along.shape, -np.inf)
+    for points, kept in ((contact, along > 0), (crossing, (along > 0) != (there > 0))):
+        reach = np.einsum("...pk,dk->...pd", points, normals)
+        most = np.maximum(most, np.where(kept[..., None], reach, -np.inf).max(-2))
+    return most
 
 
 class Occluder(EffectKind):
@@ -23,18 +37,11 @@ class Occluder(EffectKind):
 
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         left, top, right, bottom = (values[:, k, None, None, None] for k in range(4))
-        centre = view.contact.mean(-2, keepdims=True)
         most = np.full(view.reach.shape, -np.inf)
-        for ring in RINGS:
-            points = centre + ring * (view.contact - centre)
-            x, y = points[..., 0], points[..., 1]
-            hidden = (x > left) & (x < right) & (y > top) & (y < bottom)
-            along = (points[..., :, None, :] * view.normals).sum(-1)
-            most = np.maximum(most, np.where(hidden[..., None], -np.inf, along).max(-2))
-        # An outline that the rectangle leaves alone keeps its reach exactly; a hidden one has none.
-        short = most - view.reach
-        touched = short < -1.5
-        return np.where(np.isfinite(short), np.where(touched, short, 0.0), np.nan)
+        # What is seen is the outline's part to the left, the right, above and below of the rectangle: four convex pieces.
+        for axis, sign, side in ((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom)):
+            most = np.maximum(most, _beyond(view.contact, view.normals, axis, sign, side))
+        return np.where(np.isfinite(most), np.minimum(most - view.reach, 0.0), np.nan)
 
     def starts(self, view: FitView, target: int) -> list[Start]:
         return [Start(np.array(r), width=np.full(4, 6.0), places=20 * len(view.hidden)) for r in view.hidden]
