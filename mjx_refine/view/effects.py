@@ -7,9 +7,7 @@ point that it hits is followed to the next frame, where its row may be exposed a
 from __future__ import annotations
 
 import dataclasses
-import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,7 +18,6 @@ from mjx_refine.effects import acting
 from mjx_refine.effects.kind import EffectKind
 from mjx_refine.effects.registry import kind_of
 from mjx_refine.view.exposure import poses_at, straightened
-from mjx_refine.view.frames import make_frames
 from mjx_refine.view.picture import draw
 from mjx_refine.view.rows import Rows, cast_rows
 from mjx_refine.view.seen import focal_length, outline_view, rolls
@@ -205,11 +202,6 @@ def _moments(seen: np.ndarray, late: np.ndarray, part: slice) -> list[np.ndarray
     return [a.reshape(-1, bodies, 7) for a in told]
 
 
-@functools.partial(jax.jit, static_argnums=5)
-def _frames(pairs, size, position, pitch, fovy, height: int):
-    return jax.tree.map(lambda a: a[::2], make_frames(pairs, size, position, pitch, fovy, height))
-
-
 def _cast(
     here: np.ndarray, following: np.ndarray, batch: SceneBatch, rays: _Rays, change: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -218,19 +210,20 @@ def _cast(
     frames = len(here) // count // rows
     owner = np.repeat(np.arange(count), frames * rows)
     size = np.concatenate([batch.size, np.zeros((count, 1, 3))], 1)
-    view = (batch.camera_position, batch.camera_pitch, batch.camera_fovy)
-    pairs = np.stack([here, following], 1)
-    arrays = [jnp.asarray(a, jnp.float32) for a in (pairs, size[owner], *(a[owner] for a in view))]
-    made = _frames(*arrays, rays.image[1])
-    made = dataclasses.replace(made, down=made.ray[:, -1, 2], height=made.origin[:, -1, 2])
     step = np.arange(len(here))
-    line = (owner * rows + step % rows).astype(np.int32)
-    instant = (owner * frames + step // rows % frames).astype(np.int32)
+    told = (
+        np.stack([here, following], 1),
+        size[owner],
+        batch.camera_position[owner],
+        batch.camera_pitch[owner],
+        batch.camera_fovy[owner],
+    )
+    line, instant = owner * rows + step % rows, owner * frames + step // rows % frames
+    moments = Rows(*(jnp.asarray(a, jnp.float32) for a in told), *(jnp.asarray(a, jnp.int32) for a in (line, instant)))
     points = jnp.asarray(rays.points.reshape(count * rows, per_row, 2), jnp.float32)
-    changes = None if change is None else jnp.asarray(change.reshape(count * frames, *change.shape[2:]), jnp.float32)
-    told = Rows(made, arrays[0][:, 0, :-1], tuple(arrays[1:]), jnp.asarray(line), jnp.asarray(instant))
     visible = jnp.asarray(rays.visible.reshape(count * rows, per_row))
-    ids, flow = cast_rows(batch.shapes, rays.image, rays.moving, told, points, visible, changes)
+    changes = None if change is None else jnp.asarray(change.reshape(count * frames, *change.shape[2:]), jnp.float32)
+    ids, flow = cast_rows(batch.shapes, rays.image, rays.moving, moments, points, visible, changes)
     pixels = (count, frames, rows * per_row)
     return np.asarray(ids).reshape(pixels), np.asarray(flow, np.float64).reshape(*pixels, 2)
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_refine.scene import Shape
 from mjx_refine.view.distance import distance_of, surface
-from mjx_refine.view.frames import Frames
+from mjx_refine.view.frames import Frames, make_frames
 from mjx_refine.view.outline import directions, place, support_of
 from mjx_refine.view.rays import FAR, cast
 
@@ -22,19 +22,23 @@ DISTANCE = 50.0
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """S rows (or whole pictures) with one moment each.
+    """S rows (or whole pictures) with one moment each; N objects and, last, the floor.
 
     Attributes:
-      frames: of the objects and, last, of the floor; ``down`` and ``height`` are the floor's.
-      poses: of the objects.
-      view: ``geom_size`` with the floor, camera position, pitch and field of view of each.
+      poses: at the row's moment and one frame later [m, unit quaternion wxyz].
+      size: MuJoCo's ``geom_size`` [m].
+      position: the camera's [m].
+      pitch: the camera's [rad].
+      fovy: vertical field of view [rad].
       line: which points belong to it.
       instant: which change of the outlines belongs to it.
     """
 
-    frames: Frames
-    poses: Float[Array, "steps objects 7"]
-    view: tuple[Array, ...]
+    poses: Float[Array, "steps 2 bodies 7"]
+    size: Float[Array, "steps bodies 3"]
+    position: Float[Array, "steps 3"]
+    pitch: Float[Array, "steps"]
+    fovy: Float[Array, "steps"]
     line: Int[Array, "steps"]
     instant: Int[Array, "steps"]
 
@@ -60,24 +64,27 @@ def cast_rows(
       visible: where objects can be seen.
       change: what is added to the outlines' support functions [px]; None: nothing.
     """
+    made = make_frames(rows.poses, rows.size, rows.position, rows.pitch, rows.fovy, image[1])
+    made = jax.tree.map(lambda a: a[::2], made)
+    made = dataclasses.replace(made, down=made.ray[:, -1, 2], height=made.origin[:, -1, 2])
     centre = (image[0] / 2, image[1] / 2)
 
-    def one(row: Rows):
-        frames = jax.tree.map(lambda a: a[None], row.frames)
-        at = points[row.line]
+    def one(step: tuple[Frames, Rows]):
+        frames, row = jax.tree.map(lambda a: a[None], step)
+        at = points[row.line[0]]
         x, y = at[None, :, 0], at[None, :, 1]
         if change is None:
             ids, flow_x, flow_y = cast(shapes, frames, x, y, centre)
         else:
-            arrays = (row.poses[None, None], row.view[0][None, :-1], *(a[None] for a in row.view[1:]))
-            distance = _changed_distance(shapes, arrays, at, image, change[row.instant])
+            arrays = (row.poses[:, :1, :-1], row.size[:, :-1], row.position, row.pitch, row.fovy)
+            distance = _changed_distance(shapes, arrays, at, image, change[row.instant[0]])
             ids, flow_x, flow_y = _cast_outlines(shapes, frames, x, y, centre, distance)
         ids = jnp.where(visible[row.line], ids, 0)
         ground = _ground_flow(frames, x, y, centre) if moving else (0.0, 0.0)
         flow_x, flow_y = jnp.where(ids > 0, flow_x, ground[0]), jnp.where(ids > 0, flow_y, ground[1])
         return ids[0], jnp.stack([flow_x[0], flow_y[0]], -1)
 
-    return jax.lax.map(one, rows)
+    return jax.lax.map(one, (made, rows))
 
 
 def _ray(frames: Frames, k: int, x: Array, y: Array, centre: tuple[float, float]):
@@ -115,7 +122,7 @@ def _changed_distance(
     directions of ``change``, in which what is lost between directions cancels.
     """
     placed = place(shapes, arrays, image)
-    shifted = at - jnp.asarray(centre_of(image), at.dtype)
+    shifted = at - jnp.asarray([image[0] / 2, image[1] / 2], at.dtype)
     normals = jnp.asarray(directions(change.shape[-1]), at.dtype)
     along = shifted[:, :1] * normals[:, 0] + shifted[:, 1:] * normals[:, 1]
     result = []
@@ -126,11 +133,6 @@ def _changed_distance(
         wide = jnp.where(jnp.isnan(change[n]), -FAR, change[n])
         result.append(plain + (along - reach - wide).max(-1) - (along - reach).max(-1))
     return jnp.stack(result)
-
-
-def centre_of(image: tuple[int, int]) -> tuple[float, float]:
-    """The principal point [px]."""
-    return image[0] / 2, image[1] / 2
 
 
 def _cast_outlines(shapes, frames: Frames, x: Array, y: Array, centre, distance: Array):

@@ -419,6 +419,7 @@ def test_auto_falls_back_to_mujoco_and_others_refuse(monkeypatch):
         backends.backend_for("mjx", batch)
 
 
+@pytest.mark.slow
 def test_mjx_carries_floor_timing_and_centre_of_mass():
     from mjx_refine.sim.mjx import MjxSimulator
 

@@ -60,7 +60,7 @@ def afloat(shape: str = "box", size=(0.5, 0.6, 0.01), **state) -> Scene:
     return Scene((Body(shape, "thing", size, **state),), ABOVE, (0.0, 0.0, 0.0))
 
 
-def pictures(scene: Scene, *effects: Effect, frames: int = 3, size=SIZE) -> tuple[np.ndarray, np.ndarray]:
+def pictures(scene: Scene, *effects: Effect, frames: int = 4, size=SIZE) -> tuple[np.ndarray, np.ndarray]:
     told = simulate(dataclasses.replace(scene, effects=effects), size, frames, FPS)
     assert told.masks is not None
     return told.masks, told.flow
@@ -290,7 +290,7 @@ def test_a_shape_reaches_as_far_as_its_polynomials_say():
     # The fourth polynomial is x^2 - y^2 of the normal: longer in x, shorter in y by as much.
     bulge = [0.0] * 21
     bulge[3] = 0.1
-    size = (960, 640)
+    size = (480, 320)
     plain, masks = (
         pictures(afloat("sphere", (0.5,)), *e, size=size)[0][0] for e in ((), (effect("shape", "thing", bulge=bulge),))
     )
@@ -299,7 +299,7 @@ def test_a_shape_reaches_as_far_as_its_polynomials_say():
         extents = [int((m > 0).any(axis).sum()) for m in (plain, masks)]
         # The tangent plane through the camera leans by the angle of the outline: cos^2 of it.
         lean = 1 - (0.5 / HEIGHT) ** 2
-        assert extents[1] - extents[0] == pytest.approx(sign * 2 * 0.1 * lean * scale, rel=0.05)
+        assert extents[1] - extents[0] == pytest.approx(sign * 2 * 0.1 * lean * scale, abs=1.6)
 
 
 def test_a_shape_turns_with_its_body():
@@ -343,9 +343,16 @@ def test_outlines_and_flow_are_those_of_the_pictures(entry):
     np.testing.assert_allclose(told, flow[1, middle[1], middle[0]], atol=0.08)
 
 
-@pytest.mark.parametrize(
-    "entry", [*DRAWN, effect("slope", x=3.0), effect("drag", "ball", quadratic=0.5)], ids=lambda e: e.effect
-)
+QUICK = ("camera_motion", "lens_distortion", "camera_roll")
+"""The others compile more."""
+
+SCORED = [
+    pytest.param(e, id=e.effect, marks=[] if e.effect in QUICK else pytest.mark.slow)
+    for e in (*DRAWN, effect("slope", x=3.0), effect("drag", "ball", quadratic=0.5))
+]
+
+
+@pytest.mark.parametrize("entry", SCORED)
 def test_a_scene_scores_full_marks_on_its_own_clip(entry):
     scene = dataclasses.replace(SCENE, effects=(entry,))
     clip = simulate(scene, (96, 64), 4, FPS)
@@ -363,7 +370,7 @@ def test_a_scene_scores_full_marks_on_its_own_clip(entry):
 
 def test_without_masks_the_moving_region_counts():
     scene = dataclasses.replace(SCENE, effects=(effect("lens_distortion", k1=0.2),))
-    clip = dataclasses.replace(simulate(scene, (96, 64), 5, FPS), masks=None)
+    clip = dataclasses.replace(simulate(scene, (96, 64), 4, FPS), masks=None)
     assert evaluate_scene(scene, clip)["iou"] > 0.99
 
 
@@ -372,19 +379,19 @@ def test_without_masks_the_moving_region_counts():
 TINY = Options(population=12, iterations=20, optimizer="gradient", backend="mujoco", threads=1, refits=0, starts=1)
 
 
-@pytest.mark.parametrize(
-    ("effects", "options"),
-    [
-        ((effect("camera_motion", pan=15.0), effect("drag", "ball", quadratic=0.5)), TINY),
-        ((effect("slope", x=6.0), effect("dropped_frames", frame=3, count=2)), TINY),
-        ((effect("lens_distortion", k1=0.3),), dataclasses.replace(TINY, optimizer="hybrid")),
-    ],
-    ids=["camera and drag", "slope and timing", "lens"],
-)
+SLOW = pytest.mark.slow
+REFINED = [
+    pytest.param((effect("camera_motion", pan=15.0), effect("drag", "ball", quadratic=0.5)), TINY, id="camera and drag"),
+    pytest.param((effect("slope", x=6.0), effect("dropped_frames", frame=3, count=2)), TINY, id="slope and timing", marks=SLOW),
+    pytest.param((effect("lens_distortion", k1=0.3),), dataclasses.replace(TINY, optimizer="hybrid"), id="lens", marks=SLOW),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("effects", "options"), REFINED)
 def test_effects_are_held_while_the_rest_is_refined(effects, options):
     crate = dataclasses.replace(SCENE.objects[1], position=(0.7, 0.2, 0.35))
     truth = dataclasses.replace(SCENE, objects=(SCENE.objects[0], crate), effects=effects)
-    clip = simulate(truth, (96, 64), 5, FPS)
+    clip = simulate(truth, (96, 64), 4, FPS)
     ball = dataclasses.replace(truth.objects[0], position=(-0.55, 0.3, 0.78), linear_velocity=(2.3, 0.1, 1.1))
     result = refine(dataclasses.replace(truth, objects=(ball, crate)), clip, options)
     assert result.scene.effects == effects
