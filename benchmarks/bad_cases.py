@@ -211,7 +211,7 @@ SCENES = [
         scene_text(extra=[{"type": "effect", "effect": "drag", "parameters": {"quadratic": {"a": 1}}}]),
         r"parameters\.quadratic", "expected a number",
     ),
-    _scene("effect to be searched", scene_text(extra=[{"type": "effect", "effect": "drag"}]), "drag", "remove"),
+    _scene("effect without a target", scene_text(extra=[{"type": "effect", "effect": "drag"}]), "target is missing", "add"),
     _scene("every answer broken", "<think>so</think><answer>- 1</answer><answer></answer>", "sample 0", "1 more"),
     _scene("unclosed fence", "```yaml\n- type: box\n", "state is missing|size is missing", "add"),
 ]  # fmt: skip

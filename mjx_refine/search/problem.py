@@ -11,6 +11,7 @@ from mjx_fitness import UNMATCHED, Scores
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting, batch_with_effects
+from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Samples, Scene, Shape
 from mjx_refine.search.features import Outlines, flow_points, outlines
@@ -66,10 +67,7 @@ class Problem:
         self.samples, self.observation, self.options = samples, observation, options
         self._simulators: dict[tuple[Shape, ...], MujocoSimulator] = {}
         self._scorers: dict[tuple, TileScorer | PictureScorer] = {}
-        # Wrong effects are told before anything is compiled.
-        self.backends = {
-            kind_of_scene(scene): backend_for(options.backend, batch_with_effects([scene])) for scene in samples.scenes
-        }
+        self.backends = _backends(samples, options.backend)
         masks = foreground(observation)
         self.seen: Outlines = outlines(masks)
         self.flow = flow_points(masks, observation.flow, self.seen.ids)
@@ -131,6 +129,19 @@ class Problem:
                         Start(self.samples.indices[rows[k]], given, scene, moved, matching, scores.candidate(i))
                     )
         return sorted(starts, key=lambda start: (-start.fitness, start.index))
+
+
+def _backends(samples: Samples, name: str) -> dict[tuple, str]:
+    """The backend that searches scenes of each kind; wrong effects are told here, before anything is compiled."""
+    result = {}
+    for index, scene in zip(samples.indices, samples.scenes, strict=True):
+        try:
+            result[kind_of_scene(scene)] = backend_for(name, batch_with_effects([scene]))
+        except InputError as error:
+            if not scene.effects:
+                raise
+            raise InputError(f"{samples.source}: sample {index}: {error}") from error
+    return result
 
 
 @dataclasses.dataclass(frozen=True)
