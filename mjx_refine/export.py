@@ -45,8 +45,8 @@ def export_xml(scene: Scene, fps: float = 30.0) -> str:
     ``camera`` is the scene's, and the viewer's free camera starts there too.
 
     Of the effects MuJoCo's own elements hold ``slope``, ``offset_com``, ``camera_roll``, ``wind`` and a linear ``drag``
-    exactly, and ``hidden_obstacle`` as a plane without friction: what else pushes a body while it touches that plane is
-    held off too, and a body that starts far behind it is thrown out.
+    exactly, and ``hidden_obstacle`` as a plane: what else pushes a body while it touches that plane is held off too, a
+    body that starts far behind it is thrown out, and slow slip is stopped where the effect lets it creep.
 
     Args:
       scene: with no other effects.
@@ -187,7 +187,7 @@ def _check_effects(batch: SceneBatch) -> None:
 def _obstacles(
     world: ElementTree.Element, contact: ElementTree.Element, batch: SceneBatch, names: list[str], fps: float
 ) -> None:
-    """Walls that one object feels, without friction."""
+    """Walls that one object feels."""
     for effect in batch.effects:
         if effect.name != "hidden_obstacle":
             continue
@@ -208,7 +208,9 @@ def _obstacles(
         step = 1.0 / (fps * SUBSTEPS)
         solref = _numbers((-stiffness_of(step), -damping_of(restitution, step)))
         spring = {"solref": solref, "solimp": "0.9999 0.9999 0.001 0.5 2"}
-        _add(contact, "pair", geom1=name, geom2=names[effect.target], condim="1", **spring)
+        sliding = float(batch.friction[0, effect.target, 0])
+        rub = {"friction": _numbers((sliding, sliding, 0.0, 0.0, 0.0)), "solreffriction": _numbers((-1.0, -1.0 / step))}
+        _add(contact, "pair", geom1=name, geom2=names[effect.target], condim="3", **spring, **rub)
 
 
 def _forces(root: ElementTree.Element, batch: SceneBatch, names: list[str]) -> None:

@@ -177,13 +177,21 @@ def test_a_hidden_obstacle_returns_its_part_of_the_speed(restitution):
     # Where within a step the wall is reached matters; in the mean over such starts it does not.
     for shift in (np.arange(8) + 0.5) / 8 * 2 * STEP:
         place = tuple(start - shift * normal)
-        poses = rolled_out(wall, position=place, linear_velocity=tuple(-2 * normal + along))
+        poses = rolled_out(wall, position=place, linear_velocity=tuple(-2 * normal + along), friction=(0.0, 0.0))
         after = speeds(poses)[-1]
         returned.append(after @ normal / 2)
         assert after @ along == pytest.approx(1.0, abs=1e-9)
         # It turns where the wall is, having sunk in a little.
         assert 0.25 < (poses[:, 0, :3] @ normal).min() - 0.2 < 0.31
     assert np.mean(returned) == pytest.approx(restitution, abs=0.02)
+
+
+def test_a_hidden_obstacle_rubs_by_coulombs_law():
+    wall = effect("hidden_obstacle", "ball", angle=0.0, distance=-1.0, restitution=0.5)
+    poses = rolled_out(wall, linear_velocity=(-2.0, 3.0, 0.0), friction=(0.2, 0.0))
+    before, after = speeds(poses)[0], speeds(poses)[-1]
+    # While it slips, the impulse along the wall is the friction's part of that across.
+    assert before[1] - after[1] == pytest.approx(0.2 * (after[0] - before[0]), rel=1e-6)
 
 
 def test_only_its_target_feels_a_hidden_obstacle():
@@ -453,18 +461,22 @@ def exported(scene: Scene, frames: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("entry", "tolerance"),
+    ("entry", "friction", "tolerance"),
     [
-        (effect("slope", x=4.0, y=-3.0), 1e-6),
-        (effect("offset_com", "ball", x=0.05, z=-0.04), 1e-6),
-        (effect("wind", x=20.0, y=-5.0), 1e-6),
-        (effect("drag", "ball", linear=0.8), 1e-6),
-        (effect("hidden_obstacle", "ball", angle=180.0, distance=-1.0, restitution=0.6), 2e-3),
+        (effect("slope", x=4.0, y=-3.0), 0.5, 1e-6),
+        (effect("offset_com", "ball", x=0.05, z=-0.04), 0.5, 1e-6),
+        (effect("wind", x=20.0, y=-5.0), 0.5, 1e-6),
+        (effect("drag", "ball", linear=0.8), 0.5, 1e-6),
+        (effect("hidden_obstacle", "ball", angle=180.0, distance=-1.0, restitution=0.6), 0.0, 2e-3),
+        # MuJoCo's friction is no spring's, nor the effect's, which lets slow slip creep.
+        (effect("hidden_obstacle", "ball", angle=180.0, distance=-1.0, restitution=0.6), 0.5, 0.03),
     ],
     ids=lambda value: getattr(value, "effect", ""),
 )
-def test_exported_effects_are_the_simulators(entry, tolerance):
-    ball = dataclasses.replace(SCENE.objects[0], angular_velocity=(4.0, 1.0, 0.0), damping=-60.0)
+def test_exported_effects_are_the_simulators(entry, friction, tolerance):
+    ball = dataclasses.replace(
+        SCENE.objects[0], angular_velocity=(4.0, 1.0, 0.0), damping=-60.0, friction=(friction, 0.01)
+    )
     scene = Scene((ball,), CAMERA, effects=(entry,))
     expected = MujocoSimulator(scene.shapes, FPS, 1).rollout(batch_with_effects([scene]), 25)[0]
     plain = MujocoSimulator(scene.shapes, FPS, 1).rollout(
