@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -190,7 +189,9 @@ class ClipFit:
         edge = np.clip(rough(reach, m.reach, self.edge_count / DIRECTIONS), 0.4, 1.5)
         moved = np.clip(rough(flow, m.flow, self.flow_count / flow.shape[-2]), 0.7, 3.0)
         self.edge_count = float(np.clip(_independent(np.diff(reach, axis=0)), *EDGE_COUNTS))
-        self.flow_count = float(np.clip(_independent(np.moveaxis(np.diff(flow, axis=0), -1, -2)), *FLOW_COUNTS))
+        told = float(np.clip(_independent(np.moveaxis(np.diff(flow, axis=0), -1, -2)), *FLOW_COUNTS))
+        # Flow whose noise is not stated was measured, and errs smoothly in time as well.
+        self.flow_count = told if m.stated else min(told, FLOW_COUNTS[0])
         edge, moved = m.edge_noise * edge, m.flow_noise * moved
         self.measured = dataclasses.replace(m, edge_noise=np.maximum(edge, LEAST_EDGE), flow_noise=moved)
         self.noise = _everywhere(self.measured, self.frames)

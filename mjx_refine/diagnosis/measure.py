@@ -18,8 +18,8 @@ GRID = (6, 4)
 EDGE_FLOOR, FLOW_FLOOR = 0.3, 0.15
 """Noise that is assumed at least [px]: masks are drawn in whole pixels, and no flow is better."""
 
-FLOW_PART = 0.05
-"""Error of measured flow that is smooth over an object, as a part of its motion."""
+FLOW_PART = 0.08
+"""Error of measured flow that is smooth over an object, as a part of its motion; half where its noise is stated."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +36,7 @@ class Measured:
       edge_noise: of ``reach``, by object [px].
       flow_noise: of ``flow``, by object [px].
       background_noise: of ``background`` [px].
+      stated: whether the clip says how noisy its flow is.
     """
 
     reach: Float[np.ndarray, "frames objects directions"]
@@ -47,6 +48,7 @@ class Measured:
     edge_noise: Float[np.ndarray, "objects"]
     flow_noise: Float[np.ndarray, "objects"]
     background_noise: float
+    stated: bool
 
 
 def measure(observation: Observation, columns: tuple[int, ...]) -> Measured:
@@ -62,7 +64,6 @@ def measure(observation: Observation, columns: tuple[int, ...]) -> Measured:
     chosen, lost = [max(j, 0) for j in columns], np.array([j < 0 for j in columns])
     reach = np.where(lost[None, :, None], np.nan, seen.support[:, chosen])
     flow = np.where(lost[None, :, None, None], np.nan, flow[:-1, chosen])
-    reach = _without_contacts(masks, reach, [seen.ids[j] for j in chosen])
     places, background = _beside(masks, observation.flow)
     sigma = observation.flow_sigma
     given = float(np.nanmedian(sigma)) if sigma is not None else 0.0
@@ -77,12 +78,8 @@ def measure(observation: Observation, columns: tuple[int, ...]) -> Measured:
         edge_noise=np.maximum(_roughness(reach), EDGE_FLOOR),
         flow_noise=_flow_noise(pixels[:-1, chosen], flow, given),
         background_noise=max(1.5 * _spread(background), given / 3, 0.05),
+        stated=sigma is not None,
     )
-
-
-def _without_contacts(masks: np.ndarray, reach: np.ndarray, ids: list[int]) -> np.ndarray:
-    """Outlines without those that the picture's border or another mask cuts (``outlines`` has done so already)."""
-    return reach
 
 
 def _roughness(reach: Float[np.ndarray, "frames objects directions"]) -> Float[np.ndarray, "objects"]:
@@ -118,7 +115,7 @@ def _flow_noise(pixels: np.ndarray, flow: np.ndarray, given: float) -> Float[np.
     speed = np.linalg.norm(flow, axis=-1)
     typical = np.array([_median(speed[:, n]) for n in range(flow.shape[1])])
     incoherent = np.maximum(_incoherence(pixels, flow), max(given, FLOW_FLOOR))
-    return np.hypot(incoherent, FLOW_PART * typical)
+    return np.hypot(incoherent, (0.5 if given else 1.0) * FLOW_PART * typical)
 
 
 def _beside(masks: Int[np.ndarray, "frames height width"], flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -25,11 +25,6 @@ class CameraShake(EffectKind):
         yaw, pitch = _long(values[:, :half], frames), _long(values[:, half:], frames)
         return turned(np.deg2rad(yaw), np.deg2rad(pitch)), np.zeros((len(values), frames, 3))
 
-
-def _long(series: np.ndarray, frames: int) -> np.ndarray:
-    missing = frames - series.shape[1]
-    return series[:, :frames] if missing <= 0 else np.concatenate([series, np.repeat(series[:, -1:], missing, 1)], 1)
-
     def starts(self, view: FitView, target: int) -> list[Start]:
         """The jitter that the background's flow shows, summed up; it is not fitted further."""
         if not np.isfinite(view.background).any():
@@ -45,6 +40,11 @@ def _long(series: np.ndarray, frames: int) -> np.ndarray:
         angle = np.rad2deg(np.arctan(place / focal))
         values = np.concatenate([-angle[:, 0], angle[:, 1]])
         return [Start(values, fixed=tuple(range(len(values))))]
+
+
+def _long(series: np.ndarray, frames: int) -> np.ndarray:
+    missing = frames - series.shape[1]
+    return series[:, :frames] if missing <= 0 else np.concatenate([series, np.repeat(series[:, -1:], missing, 1)], 1)
 
 
 def _middle(values: np.ndarray) -> float:

@@ -48,7 +48,9 @@ class HiddenObstacle(EffectKind):
         pressed = np.minimum(depth, 0.1) * stiffness_of(motion.step) + damping * approach
         size = motion.batch.mass[:, target] * np.where((depth > 0) & (depth < 0.3), np.maximum(pressed, 0.0), 0.0)
         slip = velocity + approach[:, None] * normal
-        grip = motion.batch.friction[:, target, :1] * slip / np.maximum(np.linalg.norm(slip, axis=-1, keepdims=True), 0.05)
+        grip = (
+            motion.batch.friction[:, target, :1] * slip / np.maximum(np.linalg.norm(slip, axis=-1, keepdims=True), 0.05)
+        )
         force = size[:, None] * (normal - grip)
         return of_target(motion.batch, target, force), of_target(motion.batch, target, np.cross(arm, force))
 
