@@ -75,7 +75,7 @@ def diagnose(
     outside = held_out(clip, compared.base, best.fit if best else None)
     found = signs(clip, compared, outside.gain)
     leads = [c.lead for c in compared.candidates]
-    said = answer(found, leads, found.after)
+    said = answer(found, leads)
     told("report")
     return _result(clip, compared, outside, found, said, problem, observation, start.matching, seed, began)
 
@@ -111,28 +111,18 @@ def _check_motion(reach: np.ndarray, observation: Observation) -> None:
 
 def _verdict(compared: Compared, said: Answer, names: tuple[str, ...], shapes) -> tuple[Verdict, Candidate | None]:
     """The likeliest answer, and the hypothesis behind it."""
-    singles = compared.candidates
-    by_name: dict[str, float] = {}
-    for c, share in zip(singles, said.shares, strict=True):
-        by_name[c.names[0]] = by_name.get(c.names[0], 0.0) + share
-    top = max(by_name, key=lambda name: by_name[name], default="")
-    single = said.named * (1 - said.pair) * by_name.get(top, 0.0)
-    double = said.named * said.pair
-    pairs = [c for c in compared.pairs if c.lead > 0]
-    options = {"none": said.none, "unknown": said.unknown, "single": single, "pair": double if pairs else 0.0}
-    chosen = max(options, key=lambda key: options[key])
-    probability = options[chosen]
-    if chosen == "none":
-        return Verdict((), probability, (), "Nothing is missing: the base model explains the clip to the noise.",
-                       "Nothing more is needed; a longer or faster motion would show smaller effects."), None  # fmt: skip
-    if chosen == "unknown":
+    by_name = _by_name(compared, said)
+    if said.kind == "none":
+        text = "Nothing is seen to be missing: the base model explains the clip to the noise."
+        return Verdict((), said.probability, (), text, "A longer or faster motion would show smaller effects."), None
+    if said.kind == "unknown":
         text = "Something is missing that no effect of the catalogue explains."
-        return Verdict(
-            UNKNOWN, probability, (), text, "Film the same motion again: does the misfit come back the same?"
-        ), None
-    best = pairs[0] if chosen == "pair" else next(c for c in singles if c.names[0] == top)
+        how = "Film the same motion again: does the misfit come back the same?"
+        return Verdict(UNKNOWN, said.probability, (), text, how), None
+    top = max(by_name, key=lambda name: by_name[name], default="")
+    best = compared.pairs[0] if said.kind == "pair" else next(c for c in compared.candidates if c.names[0] == top)
     group = [name for name, share in sorted(by_name.items(), key=lambda kv: -kv[1]) if share > TOLD_APART]
-    alike = (tuple(group),) if len(group) > 1 and chosen == "single" else ()
+    alike = (tuple(group),) if len(group) > 1 and said.kind == "single" else ()
     words = []
     for t in best.fit.hypothesis.terms:
         name = names[t.target] if t.target >= 0 else ""
@@ -143,7 +133,22 @@ def _verdict(compared: Compared, said: Answer, names: tuple[str, ...], shapes) -
         text += f" This clip cannot tell {', '.join(alike[0])} apart."
     first = best.fit.hypothesis.terms[0]
     experiment = first.kind.experiment.format(target=names[first.target] if first.target >= 0 else "the object")
-    return Verdict(best.names, probability, alike, text, experiment), best
+    return Verdict(best.names, said.probability, alike, text, experiment), best
+
+
+def _by_name(compared: Compared, said: Answer) -> dict[str, float]:
+    """Share of each name, over its targets."""
+    result: dict[str, float] = {}
+    for candidate, share in zip(compared.candidates, said.shares, strict=True):
+        result[candidate.names[0]] = result.get(candidate.names[0], 0.0) + share
+    return result
+
+
+def _chance(said: Answer, share: float, first: float) -> float:
+    """Probability of one effect of the catalogue: the named one's is the answer's, the others share the rest."""
+    if said.kind == "single":
+        return said.probability if share == first else (1 - said.probability) * share / max(1 - first, 1e-9)
+    return (1 - said.probability) * share
 
 
 def _result(
@@ -226,10 +231,10 @@ def _ranked(clip: ClipFit, compared: Compared, said: Answer, outside: HeldOut, b
 
     pair = best is not None and len(best.names) > 1
     if pair and best is not None:
-        rows += [row(best, k, said.named * said.pair) for k in range(len(best.names))]
+        rows += [row(best, k, said.probability) for k in range(len(best.names))]
     told = {(r.effect, r.target) for r in rows}
     for candidate, share in zip(compared.candidates, said.shares, strict=True):
-        one = row(candidate, 0, said.named * (1 - said.pair) * share)
+        one = row(candidate, 0, _chance(said, share, max(said.shares)))
         if (one.effect, one.target) not in told:
             rows.append(one)
     return (

@@ -62,7 +62,7 @@ def held_out(clip: ClipFit, base: Fit, other: Fit | None) -> HeldOut:
     keep = kept_frames(clip.frames)
     first = _outside(clip, base, keep)
     second = first if other is None else _outside(clip, other, keep)
-    seen = [np.isfinite(a).any(tuple(range(1, a.ndim))) for a in (clip.measured.reach,)][0]
+    seen = np.isfinite(clip.measured.reach).any((1, 2))
     frames = np.nonzero(~keep & seen)[0]
     if len(frames) == 0:
         frames = np.nonzero(~keep)[0]
