@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.quality import machine
-from mjx_refine import Options, load_observation, load_scenes, refine
+from mjx_refine import Options, load_observation, load_scenes, refine, rotations
 from mjx_refine.batch import SceneBatch, batch_from_scenes
 from mjx_refine.files import write_text
 from mjx_refine.observation import Observation
@@ -39,7 +39,6 @@ from mjx_refine.search.objective import Objective
 from mjx_refine.search.problem import Problem, Start
 from mjx_refine.search.progress import Progress
 from mjx_refine.search.run import Run
-from mjx_refine import rotations
 from mjx_refine.space import Space
 
 METHODS = ("hybrid", "cmaes", "gradient", "pycma", "oracle")

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
+from mjx_refine import rotations
 from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Body, Samples, Scene
 from mjx_refine.search.options import Options
 from mjx_refine.search.problem import Problem
-from mjx_refine import rotations
 
 
 def evaluate_scene(scene: Scene, observation: Observation) -> dict:

@@ -173,15 +173,17 @@ def quaternion_of(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, 
     trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
     squares = np.stack([1 + trace] + [1 + 2 * m[..., i, i] - trace for i in range(3)], -1)
     largest = squares.argmax(-1)
+    twice = {(i, j): m[..., i, j] + m[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2))}
+    turn = {(i, j): m[..., i, j] - m[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))}
     rows = np.stack(
         [
-            np.stack([squares[..., 0], m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1),
-            np.stack([m[..., 2, 1] - m[..., 1, 2], squares[..., 1], m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0]], -1),
-            np.stack([m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] + m[..., 0, 1], squares[..., 2], m[..., 2, 1] + m[..., 1, 2]], -1),
-            np.stack([m[..., 1, 0] - m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] + m[..., 1, 2], squares[..., 3]], -1),
+            np.stack([squares[..., 0], turn[2, 1], turn[0, 2], turn[1, 0]], -1),
+            np.stack([turn[2, 1], squares[..., 1], twice[0, 1], twice[0, 2]], -1),
+            np.stack([turn[0, 2], twice[0, 1], squares[..., 2], twice[1, 2]], -1),
+            np.stack([turn[1, 0], twice[0, 2], twice[1, 2], squares[..., 3]], -1),
         ],
         -2,
-    )  # fmt: skip
+    )
     chosen = np.take_along_axis(rows, largest[..., None, None], -2)[..., 0, :]
     return chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
 

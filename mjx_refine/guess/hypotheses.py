@@ -8,13 +8,13 @@ import math
 
 import numpy as np
 
+from mjx_refine import rotations
 from mjx_refine.guess.forms import form_options, form_sets
 from mjx_refine.guess.lift import Form, Lens, extent_below, fly, onto_plane
 from mjx_refine.guess.motion import Motion, motions, restitution
 from mjx_refine.guess.scaling import scaled
 from mjx_refine.guess.tracks import Track
 from mjx_refine.scene import Body, Scene
-from mjx_refine import rotations
 
 GRAVITY = 9.81
 BODY_SIZE = 0.15

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import nnls
 
-from mjx_refine.scene import Camera, Shape
 from mjx_refine import rotations
+from mjx_refine.scene import Camera, Shape
 from mjx_refine.view.outline import directions
 
 

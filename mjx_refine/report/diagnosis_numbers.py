@@ -52,6 +52,7 @@ def diagnosis_numbers(diagnosis: Diagnosis, call: Mapping[str, Any] | None = Non
             "channels": [[CHANNELS[k] if 0 <= k < len(CHANNELS) else None for k in row] for row in diagnosis.channels],
         },
         "notes": diagnosis.notes,
+        "signs": {name: _significant(value, 4) for name, value in diagnosis.signs.items()},
         "seconds": _rounded(diagnosis.seconds, 2),
         "rollouts": diagnosis.rollouts,
     }

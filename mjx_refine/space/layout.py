@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from mjx_refine.scene import Body, Scene
 from mjx_refine import rotations
+from mjx_refine.scene import Body, Scene
 from mjx_refine.space.parameter import Parameter
 
 _AXES = ("x", "y", "z")

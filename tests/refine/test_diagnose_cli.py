@@ -40,6 +40,7 @@ def answer(scene) -> Diagnosis:
         np.ones(shape),
         np.zeros(shape, int),
         ("a note",),
+        {"lead": 20.0},
         1.5,
         100,
     )

@@ -75,6 +75,7 @@ def made_up(name: str = "box") -> Diagnosis:
         map_before=before,
         map_after=np.minimum(before, 1.5),
         channels=channels,
+        signs={"lead": 12.5},
         notes=("<b>noted</b>",),
         seconds=83.25,
         rollouts=4096,

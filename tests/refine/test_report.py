@@ -94,6 +94,7 @@ def made_up(name: str = HOSTILE, iou: float = 0.9) -> RefineResult:
             free=(FreeDirection(0.8, ((f"{name}.size.x", 0.71), ("camera.pitch", -0.7))),),
             edge=np.array([0.3, 0.4]),
             motion=np.array([0.2, 0.5]),
+            misfit=np.ones(2),
             evaluations=123,
         ),
         fixed=((f"{name}.mass", "only ratios of masses act"),),

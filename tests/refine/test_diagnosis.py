@@ -1,0 +1,169 @@
+"""The diagnosis: slack, held-out gap, the answer's rule, refusals, and a clip of our own from end to end."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from own_clip import CAMERA, SIZE
+
+from mjx_refine.diagnosis import diagnose
+from mjx_refine.diagnosis.fit import TAIL, prior
+from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
+from mjx_refine.diagnosis.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.slack import impacts, slack_of, spins
+from mjx_refine.diagnosis.verdict import Signs, answer
+from mjx_refine.effects import batch_with_effects, catalogue
+from mjx_refine.effects.acting import apparent
+from mjx_refine.errors import InputError
+from mjx_refine.observation import Observation
+from mjx_refine.scene import Body, Effect, Scene
+from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.space import Space
+from mjx_refine.view.picture import draw
+
+BALL = Body(
+    "sphere", "ball", (0.2,), (-0.9, 0.3, 0.9), linear_velocity=(2.6, 0.3, 2.0), angular_velocity=(1.0, 4.0, 2.0)
+)
+FLIGHT = Scene((BALL,), CAMERA, (0.0, 0.0, -9.81))
+
+
+def clip_of(scene: Scene, frames: int = 20, seed: int = 0) -> Observation:
+    """A clip of our own engine with noisy flow."""
+    batch = batch_with_effects([scene])
+    poses = MujocoSimulator(scene.shapes, 30.0, 1).rollout(batch, frames)
+    masks, flow = draw(apparent(poses, batch, 30.0)[0], batch, SIZE)
+    noise = np.random.default_rng(seed).normal(0.0, 0.1, flow.shape)
+    return Observation((flow + noise).astype(np.float32), masks, 30.0, flow_sigma=0.1, source="clip.npz")
+
+
+def test_slack_whitens_the_covariance_of_its_columns():
+    columns = np.random.default_rng(0).normal(size=(12, 3)) * [3.0, 1.0, 0.1]
+    whitened = slack_of(columns)(np.eye(12))
+    assert whitened @ (np.eye(12) + columns @ columns.T) @ whitened.T == pytest.approx(np.eye(12), abs=1e-9)
+
+
+def test_impacts_are_where_a_ball_bounces():
+    scene = Scene((dataclasses.replace(BALL, linear_velocity=(1.0, 0.0, 0.0)),), CAMERA)
+    batch = batch_with_effects([scene])
+    poses = MujocoSimulator(scene.shapes, 30.0, 1).rollout(batch, 30)[0]
+    found = impacts(batch, poses, 30.0)
+    lowest = int(poses[:, 0, 2].argmin())
+    assert found
+    assert abs(found[0].frame - lowest) <= 1
+
+
+def test_spins_of_a_steady_turn():
+    angle = np.arange(5) * 0.1
+    poses = np.zeros((5, 1, 7))
+    poses[:, 0, 3], poses[:, 0, 6] = np.cos(angle / 2), np.sin(angle / 2)
+    assert spins(poses, 30.0) == pytest.approx(np.tile([0.0, 0.0, 3.0], (4, 1, 1)), abs=1e-9)
+
+
+def test_the_prior_is_normal_near_the_given_scene_and_heavy_far_from_it():
+    hypothesis = Hypothesis(Space.around(FLIGHT), (term("drag", 0, 10),))
+    near, far = np.full(hypothesis.dimension, 0.01), np.full(hypothesis.dimension, 30.0)
+    assert prior(hypothesis, near)[0] == pytest.approx(near, rel=1e-4)
+    residual = prior(hypothesis, far)[0]
+    assert residual[-1] == 30.0  # an effect's
+    assert residual[0] == pytest.approx(TAIL * np.sqrt(np.log1p(225.0)))
+    step = 1e-6
+    slope = (prior(hypothesis, far + step)[0] - prior(hypothesis, far - step)[0]) / (2 * step)
+    assert np.maximum(slope, 0.1)[:-2] == pytest.approx(prior(hypothesis, far)[1][:-2], rel=1e-5)
+
+
+def test_a_third_of_the_frames_is_held_out_in_blocks():
+    keep = kept_frames(30)
+    assert keep.sum() == 21
+    assert not keep[6:9].any()
+    assert keep[:6].all()
+
+
+def test_closed_is_what_is_left_of_the_gap():
+    gap = HeldOut(np.full(9, 3.0), np.full(9, 1.5), 1.0, 0.0)
+    assert gap.closed == pytest.approx(0.75)
+    assert gap.interval(0) == (pytest.approx(0.75), pytest.approx(0.75))
+    assert HeldOut(np.ones(3), np.ones(3), 1.0, 0.0).closed == 0.0
+
+
+SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.5, 80.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind"),
+    [
+        ({}, "single"),
+        ({"lead": 20.0}, "none"),
+        ({"lead": 20.0, "structure_after": 9.0}, "unknown"),
+        ({"lead": 5.0, "whole": 9.0}, "unknown"),
+        ({"structure_after": 40.0, "after": 5.0}, "unknown"),
+        ({"pair": 200.0}, "pair"),
+    ],
+)
+def test_the_answer_follows_the_signs(changes, kind):
+    said = answer(dataclasses.replace(SIGNS, **changes), [300.0, 150.0])
+    assert said.kind == kind
+    assert 0.0 < said.probability < 1.0
+    assert sum(said.shares) == pytest.approx(1.0)
+    assert said.shares[0] > said.shares[1]
+
+
+def test_every_kind_proposes_starts_that_a_fit_can_begin_from():
+    from mjx_refine.effects.kind import FitView
+
+    batch = batch_with_effects([FLIGHT])
+    poses = MujocoSimulator(FLIGHT.shapes, 30.0, 1).rollout(batch, 20)[0]
+    velocity = np.gradient(poses[..., :3], axis=0) * 30
+    jitter = np.random.default_rng(0).normal(size=(19, 24, 2))
+    floor = np.ones((20, 1), bool)
+    view = FitView(batch, poses, velocity, 0 * velocity, floor, jitter, ((10.0, 10.0, 50.0, 60.0),), SIZE, 30.0)
+    for name, kind in catalogue().items():
+        starts = kind.starts(view, 0 if kind.targeted else -1)
+        assert starts, name
+        for start in starts:
+            assert len(start.values) == kind.length(20), name
+            low, high = (np.array([getattr(p, side) for p in kind.spread(20)]) for side in ("low", "high"))
+            assert (start.values >= low).all(), name
+            assert (start.values <= high).all(), name
+
+
+@pytest.mark.parametrize(
+    ("scene", "clip", "words"),
+    [
+        (dataclasses.replace(FLIGHT, effects=(Effect("drag", "ball"),)), None, "has an effect already"),
+        (FLIGHT, 5, "cannot tell from 5 frames"),
+        (
+            dataclasses.replace(FLIGHT, objects=(dataclasses.replace(BALL, position=(0.9, 3.0, 0.2)),)),
+            None,
+            "overlaps the clip",
+        ),
+    ],
+)
+def test_what_cannot_be_told_is_refused(scene, clip, words):
+    with pytest.raises(InputError, match=words):
+        diagnose(scene, clip_of(FLIGHT, clip or 12), threads=1)
+
+
+def test_a_still_clip_is_refused():
+    still = Scene(
+        (dataclasses.replace(BALL, position=(0.0, 0.3, 0.2), linear_velocity=(0, 0, 0), angular_velocity=(0, 0, 0)),),
+        CAMERA,
+    )
+    with pytest.raises(InputError, match="nothing moves"):
+        diagnose(still, clip_of(still, 12), threads=1)
+
+
+def test_drag_is_named_and_measured():
+    given = dataclasses.replace(FLIGHT, objects=(dataclasses.replace(BALL, linear_velocity=(2.7, 0.3, 2.05)),))
+    clip = clip_of(dataclasses.replace(FLIGHT, effects=(Effect("drag", "ball", (("quadratic", 0.5),)),)))
+    found = diagnose(given, clip, threads=1)
+    first = found.candidates[0]
+    assert first.effect == "drag"
+    assert first.target == "ball"
+    assert found.scene.effects
+    assert found.gap.after < found.gap.before
+    speed = 2.5
+    force = sum(first.parameters[name].value * speed**power for name, power in (("linear", 1), ("quadratic", 2)))
+    assert force == pytest.approx(0.5 * speed**2, rel=0.3)
+    assert sum(p.share for p in found.where) <= 1.0
