@@ -128,7 +128,8 @@ def _verdict(compared: Compared, said: Answer, names: tuple[str, ...], shapes) -
         name = names[t.target] if t.target >= 0 else ""
         words.append(t.kind.sentence.format(target=name, shape=shapes[t.target] if t.target >= 0 else ""))
     text = "; and ".join(words)
-    text = text[0].upper() + text[1:] + "."
+    # An object's name stays as it is written.
+    text = (text if text.startswith(names) else text[0].upper() + text[1:]) + "."
     if alike:
         text += f" This clip cannot tell {', '.join(alike[0])} apart."
     first = best.fit.hypothesis.terms[0]

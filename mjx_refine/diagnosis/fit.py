@@ -187,7 +187,7 @@ class ClipFit:
             return np.array([np.sqrt(_middle(square[:, n]) / 0.455) for n in range(series.shape[1])])
 
         edge = np.clip(rough(reach, m.reach, self.edge_count / DIRECTIONS), 0.4, 1.5)
-        moved = np.clip(rough(flow, m.flow, self.flow_count / flow.shape[-2]), 0.7, 3.0)
+        moved = np.clip(rough(flow, m.flow, self.flow_count / m.flow.shape[-2]), 0.7, 3.0)
         self.edge_count = float(np.clip(_independent(np.diff(reach, axis=0)), *EDGE_COUNTS))
         told = float(np.clip(_independent(np.moveaxis(np.diff(flow, axis=0), -1, -2)), *FLOW_COUNTS))
         # Flow whose noise is not stated was measured, and errs smoothly in time as well.

@@ -127,7 +127,7 @@ def _beside(masks: Int[np.ndarray, "frames height width"], flow: np.ndarray) -> 
     half = max(2, min(width, height) // 24)
     result = np.full((len(flow), len(places), 2), np.nan)
     for t in range(len(flow)):
-        near = ndimage.binary_dilation((masks[t] > 0) | (masks[t + 1] > 0), iterations=max(6, half))
+        near = np.asarray(ndimage.binary_dilation((masks[t] > 0) | (masks[t + 1] > 0), iterations=max(6, half)), bool)
         for k, (cx, cy) in enumerate(places):
             window = np.s_[max(int(cy) - half, 0) : int(cy) + half + 1, max(int(cx) - half, 0) : int(cx) + half + 1]
             values = flow[t][window][~near[window]]

@@ -274,7 +274,8 @@ def hidden_places(
     missing = np.array([ndimage.binary_erosion(d, iterations=2) & ~s for d, s in zip(known, seen, strict=True)])
     place = missing.any(0) & ~seen.any(0)
     place = ndimage.binary_opening(place, iterations=1)
-    labels, count = ndimage.label(ndimage.binary_dilation(place, iterations=2))
+    labels = np.zeros(place.shape, np.int32)
+    count = int(np.asarray(ndimage.label(ndimage.binary_dilation(place, iterations=2), output=labels)))
     boxes = []
     for k in range(count):
         rows, columns = np.nonzero((labels == k + 1) & place)
