@@ -167,7 +167,7 @@ def _result(
     before_scene = base.hypothesis.scene(base.z, clip.frames)
     after_scene = shown.hypothesis.scene(shown.z, clip.frames)
     scores = [problem.score([s], matching) for s in (before_scene, after_scene)]
-    view = view_of(clip, shown, observation, matching)
+    view = view_of(clip, shown, observation, matching, hidden=False)
     channels = misfit_map(clip, base)[1]
     gap = _gap(outside, scores, seed)
     return Diagnosis(
@@ -175,7 +175,7 @@ def _result(
         gap=gap,
         where=places(clip, base, best.fit if best else None, view),
         candidates=tuple(_ranked(clip, compared, said, outside, best)),
-        residual=describe(clip, base, view_of(clip, base, observation, matching)),
+        residual=describe(clip, base, view_of(clip, base, observation, matching, hidden=False)),
         remaining=describe(clip, shown, view),
         base=before_scene,
         scene=after_scene,

@@ -240,8 +240,10 @@ def _target_name(scene: Scene, target: int) -> str:
 # --- what kinds see ---------------------------------------------------------------------------------------------------
 
 
-def view_of(clip: ClipFit, fit: Fit, observation: Observation, masks_of: tuple[int, ...]) -> FitView:
-    """The fitted rollout, for those who look for a start."""
+def view_of(
+    clip: ClipFit, fit: Fit, observation: Observation, masks_of: tuple[int, ...], hidden: bool = True
+) -> FitView:
+    """The fitted rollout, for those who look for a start; ``hidden``: with what should be seen and is not, which is drawn."""
     batch = fit.hypothesis.batch(fit.z[None])
     poses = np.nan_to_num(clip.poses(fit.hypothesis, fit.z[None])[0])
     fps = clip.simulator.fps
@@ -257,8 +259,8 @@ def view_of(clip: ClipFit, fit: Fit, observation: Observation, masks_of: tuple[i
     )
     on_floor = poses[..., 2] - lowest < 0.01
     plain = dataclasses.replace(batch, effects=())
-    hidden = hidden_places(poses, plain, observation, masks_of)
-    return FitView(plain, poses, velocity, spin, on_floor, clip.measured.background, hidden, clip.image, fps)
+    places = hidden_places(poses, plain, observation, masks_of) if hidden else ()
+    return FitView(plain, poses, velocity, spin, on_floor, clip.measured.background, places, clip.image, fps)
 
 
 def hidden_places(

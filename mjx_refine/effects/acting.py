@@ -197,9 +197,8 @@ def camera_path(
     batch: SceneBatch, frames: int, fps: float
 ) -> tuple[Float[np.ndarray, "batch frames 3 3"], Float[np.ndarray, "batch frames 3"]]:
     """Camera to world in every frame, and its position [m]."""
-    c, s = np.cos(batch.camera_pitch), np.sin(batch.camera_pitch)
-    zero, one = np.zeros_like(c), np.ones_like(c)
-    base = np.moveaxis(np.array([[one, zero, zero], [zero, c, -s], [zero, s, c]]), -1, 0)[:, None]
+    level = np.zeros_like(batch.camera_pitch)
+    base = rotations.matrix(rotations.exponential(np.stack([batch.camera_pitch, level, level], -1)))[:, None]
     turn = np.broadcast_to(np.eye(3), (len(batch), frames, 3, 3))
     travel = np.zeros((len(batch), frames, 3))
     for kind, effect in _acting(batch):

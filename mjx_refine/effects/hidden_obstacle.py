@@ -20,7 +20,7 @@ class HiddenObstacle(EffectKind):
     """An upright wall that the target alone feels.
 
     Its face is n . p = distance with the outward normal n = (cos angle, sin angle, 0). The contact is a damped spring
-    without friction at the body's foremost point that pushes and never pulls.
+    at the body's foremost point that pushes and never pulls, and rubs with the body's own sliding friction.
     """
 
     name = "hidden_obstacle"

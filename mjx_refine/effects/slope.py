@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mjx_refine import rotations
 from mjx_refine.effects.kind import EffectKind, EffectParameter
 
 
@@ -19,8 +20,8 @@ class Slope(EffectKind):
     parameters = (EffectParameter("x", "degree", 4.0, -60.0, 60.0), EffectParameter("y", "degree", 4.0, -60.0, 60.0))
 
     def floor(self, values: np.ndarray) -> np.ndarray | None:
-        a, b = np.deg2rad(values[:, 0]), np.deg2rad(values[:, 1])
-        zero, one = np.zeros_like(a), np.ones_like(a)
-        about_x = np.array([[one, zero, zero], [zero, np.cos(a), -np.sin(a)], [zero, np.sin(a), np.cos(a)]])
-        about_y = np.array([[np.cos(b), zero, np.sin(b)], [zero, one, zero], [-np.sin(b), zero, np.cos(b)]])
-        return np.moveaxis(about_y, -1, 0) @ np.moveaxis(about_x, -1, 0)
+        angle = np.deg2rad(values)
+        zero = np.zeros(len(values))
+        about_x = rotations.matrix(rotations.exponential(np.stack([angle[:, 0], zero, zero], -1)))
+        about_y = rotations.matrix(rotations.exponential(np.stack([zero, angle[:, 1], zero], -1)))
+        return about_y @ about_x
