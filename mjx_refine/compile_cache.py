@@ -46,7 +46,7 @@ def enable_cache() -> Path | None:
         log.warning("%s: no compilation cache (%s); set %s to another folder", folder, error.strerror, VARIABLE)
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
     if importlib.util.find_spec("warp") is not None:
         warp = importlib.import_module("warp")
         warp.config.kernel_cache_dir = str(folder / "warp")
