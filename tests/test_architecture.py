@@ -27,8 +27,8 @@ LAYERS = (
     {"gradients"},
     {"search"},
     {"diagnosis"},
-    {"simulate", "evaluate", "export", "observe", "guess"},
-    {"report"},
+    {"simulate", "evaluate", "export", "observe", "guess", "describe"},
+    {"report", "edit"},
     {"__init__"},
     {"cli"},
 )

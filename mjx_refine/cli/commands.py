@@ -11,6 +11,7 @@ from pathlib import Path
 
 import click
 
+from mjx_refine.cli.describe import describe
 from mjx_refine.cli.diagnose import diagnose
 from mjx_refine.cli.types import FiniteFloat, Size
 from mjx_refine.errors import InputError
@@ -200,3 +201,4 @@ def evaluate(scene: Path, video: Path, truth) -> None:
 
 
 app.add_command(diagnose)
+app.add_command(describe)
