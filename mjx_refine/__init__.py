@@ -4,23 +4,29 @@
 """
 
 from mjx_refine.errors import InputError
+from mjx_refine.many import Job, Many, Outcome, load_jobs, refine_many
 from mjx_refine.observation import Observation, load_observation, make_observation, save_observation
 from mjx_refine.scene import Scene, load_scene, load_scenes, parse_scenes, save_scene, save_scenes
 from mjx_refine.search import Options, Progress, RefineResult, refine
 
 __all__ = [
     "InputError",
+    "Job",
+    "Many",
     "Observation",
     "Options",
+    "Outcome",
     "Progress",
     "RefineResult",
     "Scene",
+    "load_jobs",
     "load_observation",
     "load_scene",
     "load_scenes",
     "make_observation",
     "parse_scenes",
     "refine",
+    "refine_many",
     "save_observation",
     "save_scene",
     "save_scenes",

@@ -48,6 +48,7 @@ def result_numbers(result: RefineResult, observation: Observation) -> dict[str, 
         "problems": [{"index": problem.index, "reason": problem.reason} for problem in result.problems],
         "clip": {"frames": observation.length, "fps": observation.fps, "size": list(observation.size)},
         "options": dataclasses.asdict(result.options),
+        "digest": result.digest,
     }
     return plain(numbers)
 

@@ -6,20 +6,16 @@ import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, cast
-
-import yaml
 
 from mjx_refine.errors import InputError
 from mjx_refine.scene import fields
 from mjx_refine.scene.model import SHAPES, Body, Camera, Effect, Quaternion, Scene
+from mjx_refine.scene.plain import load_plain, read_text
 from mjx_refine.scene.text import sample_texts
 
-MAX_BYTES = 32 * 2**20
 MAX_SAMPLES = 4096
 MAX_SAMPLE_BYTES = 256 * 2**10
-MAX_NODES = 100_000
 _STATE = ("position", "orientation", "linear_velocity", "angular_velocity")
 _PHYSICS = ("friction", "mass", "damping", "stiffness")
 _SIZE_KEYS = {"box": ("size",), "cylinder": ("radius", "height"), "sphere": ("radius",)}
@@ -56,45 +52,13 @@ class Samples:
         return self.scenes[i]
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """A safe loader that refuses a mapping with the same key twice."""
-
-
-def _construct_mapping(loader: _UniqueKeyLoader, node: yaml.MappingNode) -> dict:
-    seen = set()
-    for key_node, _ in node.value:
-        key = key_node.value if isinstance(key_node, yaml.ScalarNode) else None
-        if key in seen:
-            raise yaml.constructor.ConstructorError(
-                None, None, f"the key {fields.show(key)} stands twice", key_node.start_mark
-            )
-        seen.add(key)
-    return yaml.SafeLoader.construct_mapping(loader, node, deep=True)
-
-
-_UniqueKeyLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
-
-
 def load_scenes(path: str | os.PathLike) -> Samples:
     """Reads every sample of a scene file: a list, ``<answer>`` blocks, fenced blocks, or YAML documents.
 
     Raises:
       InputError: the file cannot be read, or no sample of it can.
     """
-    path = Path(path)
-    try:
-        with open(path, "rb") as stream:
-            content = stream.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be read ({reason}); expected a scene file in YAML; check the name") from error
-    if len(content) > MAX_BYTES:
-        raise InputError(f"{path}: larger than {MAX_BYTES >> 20} MiB; expected scene samples in YAML; split the file")
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is not UTF-8; expected a scene file in YAML text") from error
-    return parse_scenes(text, source=str(path))
+    return parse_scenes(read_text(path, "a scene file in YAML"), source=str(path))
 
 
 def parse_scenes(text: str, source: str = "<text>") -> Samples:
@@ -144,65 +108,7 @@ def _parse_scene(text: str, place: str) -> Scene:
             f"{place}: a sample of {len(text)} characters; expected at most {MAX_SAMPLE_BYTES}, a scene of 64 objects "
             "has 40000; remove or split it"
         )
-    try:
-        entries = _load_yaml(text)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f": line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or str(error)
-        raise InputError(
-            f"{place}{line}: not safe YAML: {fields.cut(problem)}; correct or remove the sample"
-        ) from error
-    except (
-        ValueError,
-        RecursionError,
-        ArithmeticError,
-        TypeError,
-        AttributeError,
-        KeyError,
-        IndexError,
-    ) as error:
-        raise InputError(
-            f"{place}: not readable YAML: {fields.cut(str(error))}; correct or remove the sample"
-        ) from error
-    return scene_from_entries(entries, place)
-
-
-def _load_yaml(text: str) -> object:
-    """The one document in ``text``, of plain data.
-
-    Raises:
-      yaml.YAMLError: broken, unsafe, or aliases make it refer to itself or grow beyond MAX_NODES.
-    """
-    loader = _UniqueKeyLoader(text)
-    try:
-        node = loader.get_single_node()
-        if node is None:
-            return None
-        _expanded_size(node, {})
-        return loader.construct_document(node)
-    finally:
-        loader.dispose()
-
-
-def _expanded_size(node: yaml.Node, known: dict[int, int | None]) -> int:
-    """How many nodes ``node`` holds where every alias counts in full."""
-    if id(node) in known:
-        size = known[id(node)]
-        if size is None:
-            raise yaml.constructor.ConstructorError(None, None, "an alias refers to itself", node.start_mark)
-        return size
-    known[id(node)] = None
-    children = node.value if isinstance(node, yaml.CollectionNode) else ()
-    if isinstance(node, yaml.MappingNode):
-        children = [part for pair in children for part in pair]
-    size = 1 + sum(_expanded_size(child, known) for child in children)
-    if size > MAX_NODES:
-        raise yaml.constructor.ConstructorError(
-            None, None, f"more than {MAX_NODES} values, with aliases written out", node.start_mark
-        )
-    known[id(node)] = size
-    return size
+    return scene_from_entries(load_plain(text, place, "the sample"), place)
 
 
 def scene_from_entries(entries: object, place: str = "<scene>") -> Scene:

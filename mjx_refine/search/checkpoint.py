@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import zipfile
@@ -12,6 +13,9 @@ import numpy as np
 
 from mjx_refine import files
 from mjx_refine.errors import InputError
+from mjx_refine.observation import Observation
+from mjx_refine.scene import Samples
+from mjx_refine.search.options import Options
 
 VERSION = 1
 
@@ -27,6 +31,13 @@ def digest(*parts: object) -> str:
             state.update(repr(part).encode())
         state.update(b"\0")
     return state.hexdigest()
+
+
+def input_digest(samples: Samples, observation: Observation, options: Options) -> str:
+    """A fingerprint of what decides a run's result; neither threads nor pictures that are only shown belong to it."""
+    chosen = dataclasses.asdict(dataclasses.replace(options, threads=None))
+    masks = observation.masks if observation.masks is not None else "no masks"
+    return digest(observation.flow, observation.fps, samples.scenes, chosen, masks)
 
 
 def save_checkpoint(path: Path, values: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:

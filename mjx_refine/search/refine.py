@@ -99,6 +99,7 @@ def refine(
         },
         problems=samples.problems,
         derivatives=found.derivatives,
+        digest=run.digest,
     )
 
 

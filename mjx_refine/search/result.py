@@ -73,6 +73,7 @@ class RefineResult:
       seconds: total, compile, search.
       problems: samples that could not be read.
       derivatives: which could be trusted where the landings ended; None where nobody looked.
+      digest: of samples, clip and options: the same call has the same.
     """
 
     options: Options
@@ -93,6 +94,7 @@ class RefineResult:
     seconds: dict[str, float]
     problems: tuple[SampleProblem, ...] = ()
     derivatives: Derivatives | None = None
+    digest: str = ""
 
     @property
     def scene(self) -> Scene:

@@ -13,7 +13,7 @@ from mjx_fitness import Scores
 
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.scene import Scene
-from mjx_refine.search.checkpoint import damaged, digest, load_checkpoint, save_checkpoint
+from mjx_refine.search.checkpoint import damaged, input_digest, load_checkpoint, save_checkpoint
 from mjx_refine.search.derivatives import DerivativeChoice, Derivatives
 from mjx_refine.search.intervals import Intervals, intervals
 from mjx_refine.search.landed import LANDED_WELL, Landed, first_covariance
@@ -88,9 +88,7 @@ class Run:
         self.problem, self.options, self.progress = problem, problem.options, progress
         self.path, self.choice = checkpoint, DerivativeChoice(problem, progress.message)
         self.began = time.monotonic()
-        observation = problem.observation
-        parts = [observation.flow, observation.fps, problem.samples.scenes, dataclasses.asdict(self.options)]
-        self.digest = digest(*parts, observation.masks if observation.masks is not None else "no masks")
+        self.digest = input_digest(problem.samples, problem.observation, self.options)
         self.history: list[Step] = []
         self.landed: list[Landed] = []
         self.evaluations = 0
