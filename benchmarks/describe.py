@@ -41,20 +41,20 @@ class Tally:
     refused: int = 0
 
 
-def random_scene(seed: int) -> Scene:
-    """A scene of one to four objects in one of six kinds of motion."""
+def random_scene(seed: int, most: int = 4) -> Scene:
+    """A scene of one to ``most`` objects in one of six kinds of motion."""
     rng = np.random.default_rng(seed)
     kind = str(rng.choice(KINDS))
-    objects = int(rng.integers(2 if kind == "collision" else 1, 5))
+    objects = int(rng.integers(2 if kind == "collision" else 1, most + 1))
     return scene_from_entries(draw_scene(rng, kind, objects))
 
 
-def run(count: int, seed: int, size: tuple[int, int], mutants: int) -> Tally:
+def run(count: int, seed: int, size: tuple[int, int], mutants: int, most: int = 4) -> Tally:
     """Describes ``count`` scenes and checks each description against a simulation of its own answer."""
     tally = Tally()
     for number in range(seed, seed + count):
         try:
-            description = describe(random_scene(number), size=size, seed=number)
+            description = describe(random_scene(number, most), size=size, seed=number)
         except InputError:
             tally.refused += 1
             continue
