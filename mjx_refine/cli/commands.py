@@ -6,13 +6,14 @@ import contextlib
 import json
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import click
 
 from mjx_refine.cli.describe import describe
 from mjx_refine.cli.diagnose import diagnose
+from mjx_refine.cli.many import ENGINES, refine_many_command
 from mjx_refine.cli.types import FiniteFloat, Size
 from mjx_refine.errors import InputError
 
@@ -25,9 +26,19 @@ SOLVERS = ("lm", "adam", "gauss-newton", "levenberg-marquardt")
 
 
 @click.group(invoke_without_command=True, no_args_is_help=False, context_settings={"show_default": True})
-@click.option("--init", type=_PATH, help="Starting samples (YAML): one scene, or the 32 of a language model.")
-@click.option("--video", type=_PATH, help="Observation (npz with flow, masks, fps); see `refine observe`.")
-@click.option("--out", type=_PATH, default=Path("refined"), help="Folder for the results.")
+@click.option(
+    "--init",
+    type=_PATH,
+    multiple=True,
+    help="Starting samples (YAML): one scene, or the 32 of a language model; again, with --video, for another clip.",
+)
+@click.option(
+    "--video", type=_PATH, multiple=True, help="Observation (npz with flow, masks, fps); see `refine observe`."
+)
+@click.option("--jobs", type=_PATH, help="Many clips: a list of jobs (YAML), each with init, video and a name.")
+@click.option(
+    "--out", type=_PATH, default=Path("refined"), help="Folder for the results; of many clips, with a folder each."
+)
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, help="Of everything random.")
 @click.option("--population", type=click.IntRange(4, 65536), default=128, help="Candidates a generation.")
 @click.option(
@@ -41,23 +52,45 @@ SOLVERS = ("lm", "adam", "gauss-newton", "levenberg-marquardt")
 @click.option(
     "--refits", type=click.IntRange(0, 1000), default=6, help="Fits around the solution, for intervals; 0: none."
 )
-@click.option("--resume", is_flag=True, help="Go on from the checkpoint in --out.")
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint in --out; of many clips, skip finished ones.")
+@click.option("--workers", type=click.IntRange(1, 4096), help="Of many clips, how many at once; all cores by default.")
+@click.option("--engine", type=click.Choice(ENGINES), default="processes", help="What works through many clips.")
+@click.option("--address", help="Of a Ray cluster, for --engine ray.")
 @click.version_option(package_name="mjx-refine", prog_name="refine")
 @click.pass_context
-def app(context: click.Context, init, video, out, resume, **options) -> None:
+def app(context: click.Context, init, video, jobs, out, resume, workers, engine, address, **options) -> None:
     """Refines a rough scene until its MuJoCo simulation replays a video.
 
     refine --init best32.yaml --video flows.npz --out refined
     """
     logging.basicConfig(level=logging.INFO if sys.stderr.isatty() else logging.WARNING, format="%(message)s")
     if context.invoked_subcommand is not None:
-        if init or video:
-            raise click.UsageError("--init and --video stand after the command's name")
+        if init or video or jobs:
+            raise click.UsageError("--init, --video and --jobs stand after the command's name")
         return
-    for name, value in (("--init", init), ("--video", video)):
-        if value is None:
+    _check_call(context, init, video, jobs)
+    if jobs is None and len(init) == 1 and engine == "processes":
+        _refine(init[0], video[0], out, resume, options)
+    else:
+        how = {"workers": workers, "resume": resume, "engine": engine, "address": address}
+        refine_many_command(init, video, jobs, out, options, **how)
+
+
+def _check_call(context: click.Context, init: Sequence[Path], video: Sequence[Path], jobs: Path | None) -> None:
+    """Refuses a call whose options do not go together."""
+    if jobs is not None:
+        if init or video:
+            raise click.UsageError("--jobs beside --init or --video; expected one of them; leave one out", ctx=context)
+        return
+    for name, values in (("--init", init), ("--video", video)):
+        if not values:
             raise click.UsageError(f"Missing option {name!r}", ctx=context)
-    _refine(init, video, out, resume, options)
+    if len(init) != len(video):
+        raise click.UsageError(
+            f"{len(init)} --init and {len(video)} --video; expected as many of each, in the same order; "
+            "give a --video after every --init",
+            ctx=context,
+        )
 
 
 def _refine(init: Path, video: Path, out: Path, resume: bool, options: dict) -> None:
