@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mjx_refine.many import Many, ManyProgress, Outcome
 
 ENGINES = ("processes", "ray")
-WIDTH = 150
+WIDTH = 120
 """Of the table where standard output is no terminal."""
 
 
@@ -50,7 +50,7 @@ def refine_many_command(
 
 
 def print_table(many: Many) -> None:
-    """A row a job on standard output, then how many there are of each status."""
+    """On standard output: a row a job, a line for each that has a reason to tell, how many there are of each status."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -62,11 +62,13 @@ def print_table(many: Many) -> None:
         table.add_column(title, justify="right", no_wrap=True)
     for title in ("rollouts", "s"):
         table.add_column(title, justify="right")
-    table.add_column("why", overflow="fold")
     for outcome in many.outcomes:
         table.add_row(*(Text(_printable(cell)) for cell in _cells(outcome)))
     console = Console(width=None if sys.stdout.isatty() else WIDTH, highlight=False)
     console.print(table)
+    for outcome in many.outcomes:
+        if outcome.reason:
+            click.echo(_printable(f"{outcome.name}: {outcome.reason}"))
     counts: dict[str, int] = {}
     for outcome in many.outcomes:
         counts[outcome.status] = counts.get(outcome.status, 0) + 1
@@ -85,7 +87,6 @@ def _cells(outcome: Outcome) -> list[str]:
         change(outcome.fitness_before, outcome.fitness_after),
         "" if outcome.evaluations is None else str(outcome.evaluations),
         "" if outcome.seconds is None else f"{outcome.seconds:.0f}",
-        outcome.reason,
     ]
 
 

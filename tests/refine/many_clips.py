@@ -11,8 +11,8 @@ from mjx_refine.scene import load_scenes
 from mjx_refine.search import Options
 from mjx_refine.simulate import simulate
 
-TINY = Options(population=8, iterations=6, seed=3, refits=2)
-TINY_CALL = ["--population", "8", "--iterations", "6", "--seed", "3", "--refits", "2"]
+TINY = Options(population=8, iterations=5, seed=3, refits=1)
+TINY_CALL = ["--population", "8", "--iterations", "5", "--seed", "3", "--refits", "1"]
 
 
 def tiny_clip(folder: Path, shift: float = 0.0) -> Path:
