@@ -29,6 +29,7 @@ LAYERS = (
     {"diagnosis"},
     {"simulate", "evaluate", "export", "observe", "guess", "describe"},
     {"report", "edit"},
+    {"many"},
     {"__init__"},
     {"cli"},
 )
