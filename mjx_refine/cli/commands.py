@@ -13,6 +13,7 @@ import click
 
 from mjx_refine.cli.describe import describe
 from mjx_refine.cli.diagnose import diagnose
+from mjx_refine.cli.edit import edit
 from mjx_refine.cli.many import ENGINES, refine_many_command
 from mjx_refine.cli.types import FiniteFloat, Size
 from mjx_refine.errors import InputError
@@ -235,3 +236,4 @@ def evaluate(scene: Path, video: Path, truth) -> None:
 
 app.add_command(diagnose)
 app.add_command(describe)
+app.add_command(edit)

@@ -127,11 +127,10 @@ def _seen(told: s.Seen | s.NeverSeen, seen: Record) -> str:
 
 
 def _placed(told: s.Placed, seen: Record) -> str:
-    for axis, word, value in zip(
-        "xyz", (told.x, told.y, told.z), _at(told.when, seen.position, told, seen), strict=True
-    ):
+    where = _at(told.when, seen.position, told, seen)
+    for (axis, places), word, value in zip(PLACES.items(), (told.x, told.y, told.z), where, strict=True):
         edges = (-math.inf, *BORDERS, math.inf)
-        k = PLACES[axis].index(word)
+        k = places.index(word)
         inside = edges[k] <= value < edges[k + 1] and abs(value) >= 0.5
         if not (abs(value) < 0.5 if k == 3 else inside or (k == 2 and value == -0.5)):
             return f"{axis} is {value:.4f} m"
