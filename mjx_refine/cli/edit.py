@@ -39,7 +39,7 @@ def edit(scene: Path, instruction: str, out: Path, preview, flow, size, frames: 
     pictures = []
     if preview is not None or flow is not None:
         pictures = _simulated(result, scene, preview is not None, {"size": size, "frames": frames, "fps": fps})
-    shown = b"" if preview is None else _sheet(preview, pictures)
+    shown = b"" if preview is None else _sheet(preview, pictures, (result.scene_before.names, result.scene.names))
     write_atomic(out, lambda stream: stream.write(result.after.encode()))
     if flow is not None:
         _write_flow(flow, pictures[-1])
@@ -85,10 +85,10 @@ def _simulated(result, scene: Path, both: bool, options: dict) -> list:
     return told
 
 
-def _sheet(preview: Path, pictures: list) -> bytes:
+def _sheet(preview: Path, pictures: list, names: tuple) -> bytes:
     from mjx_refine.edit import gif_sheet, png_sheet
 
-    return (gif_sheet if preview.suffix.lower() == ".gif" else png_sheet)(*pictures)
+    return (gif_sheet if preview.suffix.lower() == ".gif" else png_sheet)(pictures[0], pictures[1], names)
 
 
 def _write_flow(flow: Path, observation) -> None:

@@ -151,8 +151,9 @@ def content_end(node: yaml.Node) -> int:
 
 
 def number_text(value: float, like: str = "") -> str:
-    """A number with at most twelve digits, as YAML reads it; whole where ``like`` is written whole and it is."""
-    short = float(f"{value:.12g}") + 0.0
+    """A number with at most twelve digits and places, as YAML reads it; whole where ``like`` is written whole and it is."""
+    # What sines leave of a zero is a zero.
+    short = 0.0 if abs(value) < 1e-12 else float(f"{value:.12g}")
     if _INTEGER.fullmatch(like) and short == int(short):
         return str(int(short))
     text = repr(short)

@@ -24,35 +24,48 @@ _COLUMNS = 5
 _WIDTH = 240
 
 
-def pictures(observation: Observation, largest: float) -> list[UInt8[np.ndarray, "height width 3"]]:
-    """Of every frame the objects, and below them the flow to the next frame (of the last frame, the flow to it)."""
+Names = tuple[tuple[str, ...], tuple[str, ...]]
+
+
+def pictures(observation: Observation, largest: float, colours: list[int]) -> list[UInt8[np.ndarray, "height width 3"]]:
+    """Of every frame the objects, and below them the flow to the next frame (of the last frame, the flow to it).
+
+    Args:
+      observation: masks and flow.
+      largest: flow with full saturation [px/frame].
+      colours: for each object the number of its colour, from 0.
+    """
     found = []
+    palette = np.array([0, *(k % (len(_COLOURS) - 1) + 1 for k in colours)])
     for t in range(observation.length):
         masks = np.zeros(observation.size[::-1], int) if observation.masks is None else observation.masks[t]
-        shown = _COLOURS[np.where(masks > 0, (masks - 1) % (len(_COLOURS) - 1) + 1, 0)]
+        shown = _COLOURS[palette[masks]]
         flow = flow_colours(observation.flow[min(t, observation.length - 2)], largest)
         found.append(np.concatenate([shown, flow]))
     return found
 
 
-def png_sheet(before: Observation, after: Observation) -> bytes:
-    """A PNG with some frames side by side: the two rows above are before the edit, the two below after it."""
+def png_sheet(before: Observation, after: Observation, names: Names) -> bytes:
+    """A PNG with some frames side by side: the two rows above are before the edit, the two below after it.
+
+    ``names`` are the objects' before and after, so that each keeps its colour.
+    """
     largest = _largest(before, after)
     picks = np.unique(np.linspace(0, before.length - 1, min(_COLUMNS, before.length)).astype(int))
     rows = []
-    for name, observation in (("before", before), ("after", after)):
-        shown = pictures(observation, largest)
+    for name, observation, colours in zip(("before", "after"), (before, after), _colours(names), strict=True):
+        shown = pictures(observation, largest, colours)
         rows.append(np.hstack([_labelled(_fitted(shown[t]), f"{name}, frame {t}") for t in picks]))
     stream = io.BytesIO()
     Image.fromarray(np.vstack(rows)).save(stream, "PNG", optimize=True)
     return stream.getvalue()
 
 
-def gif_sheet(before: Observation, after: Observation) -> bytes:
+def gif_sheet(before: Observation, after: Observation, names: Names) -> bytes:
     """An endless GIF at the clip's rate (2 to 33 frames a second): before the edit on the left, after it on the right."""
     largest = _largest(before, after)
     stride = -(-before.length // _MOST_FRAMES)
-    sides = [pictures(observation, largest)[::stride] for observation in (before, after)]
+    sides = [pictures(o, largest, c)[::stride] for o, c in zip((before, after), _colours(names), strict=True)]
     frames = [
         Image.fromarray(
             np.hstack([_labelled(_fitted(image, 360), f"{name}, frame {k * stride}") for name, image in
@@ -64,6 +77,11 @@ def gif_sheet(before: Observation, after: Observation) -> bytes:
     stream = io.BytesIO()
     frames[0].save(stream, "GIF", save_all=True, append_images=frames[1:], duration=delay, loop=0, disposal=1)
     return stream.getvalue()
+
+
+def _colours(names: Names) -> list[list[int]]:
+    known = list(dict.fromkeys([*names[0], *names[1]]))
+    return [[known.index(name) for name in side] for side in names]
 
 
 def _largest(*observations: Observation) -> float:

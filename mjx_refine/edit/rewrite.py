@@ -100,7 +100,7 @@ def _inserted(document: Document, entry: yaml.MappingNode, section: str, values:
                 "number; write it, or remove the key"
             )
         return _appended(document, node, values)
-    inside = "{" + ", ".join(f"{key}: {text}" for key, text in values.items()) + "}"
+    inside = "{" + ", ".join(f"{_word(document, key)}: {text}" for key, text in values.items()) + "}"
     if node is None:
         return _appended(document, entry, {section: inside})
     start, end = node.start_mark.index, node.end_mark.index
@@ -112,7 +112,7 @@ def _appended(document: Document, node: yaml.MappingNode, values: dict[str, str]
     _refuse_shared(document, node, tuple(values))
     end = content_end(node.value[-1][1])
     if node.flow_style:
-        return Patch(end, end, "".join(f", {key}: {text}" for key, text in values.items()))
+        return Patch(end, end, "".join(f", {_word(document, key)}: {text}" for key, text in values.items()))
     at = line_end(document.yaml, end)
     indent = " " * node.value[0][0].start_mark.column
     return Patch(at, at, "".join(f"\n{indent}{key}: {text}" for key, text in values.items()))
@@ -128,10 +128,17 @@ def _new_gravity(document: Document, wanted: Scene) -> Patch:
     gravity = vector_text(wanted.gravity)
     if document.root.flow_style:
         end = content_end(document.root.value[-1])
-        return Patch(end, end, f", {{type: gravity, gravity: {gravity}}}")
+        kind, word = _word(document, "type"), _word(document, "gravity")
+        return Patch(end, end, f", {{{kind}: {word}, {word}: {gravity}}}")
     at = line_end(document.yaml, content_end(document.root.value[-1]))
     indent = " " * document.root.start_mark.column
     return Patch(at, at, f"\n{indent}- type: gravity\n{indent}  gravity: {gravity}")
+
+
+def _word(document: Document, word: str) -> str:
+    """A key or type as the text writes them: JSON has them in quotation marks."""
+    first = document.root.value[0].value[0][0]
+    return json.dumps(word) if first.style == '"' else word
 
 
 def _block_span(document: Document, node: yaml.MappingNode) -> tuple[int, int]:
@@ -178,6 +185,8 @@ def with_copy(document: Document, name: str, new: str) -> str:
             f"{document.source}: {name} holds anchors or aliases, which cannot be copied; write the values out"
         )
     named = find(node, "name")
+    if isinstance(named, yaml.ScalarNode) and named.style == '"':
+        shown = json.dumps(new)
     text = document.yaml[start:end]
     if named is None:
         first = node.value[0][0].start_mark

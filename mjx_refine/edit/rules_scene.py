@@ -67,7 +67,7 @@ def _remove(scene: Scene, match: re.Match[str]) -> Step:
 
 
 @rule(
-    rf"(?:copy|duplicate|clone) {TARGET}(?: (?:as|named|called) (?P<name>\"(?:[^\"\\]|\\.)*\"|[\w-]+))?"
+    rf"(?:copy|duplicate|clone) {TARGET}(?: (?:as|named|called) (?P<name>\"(?:[^\"\\]|\\.)*\"|[\w-]+|@\d+))?"
     rf"(?: (?P<place>(?:at|to) {VECTOR}(?: m)?|by {VECTOR}(?: m)?|(?:by )?{AMOUNT} {DIRECTION}))?",
     "copy OBJECT", "copy OBJECT as NAME NUMBER m to the right", "copy OBJECT as NAME at [X, Y, Z]",
 )  # fmt: skip
@@ -78,6 +78,7 @@ def _copy(scene: Scene, match: re.Match[str]) -> Step:
     body = scene.objects[which[0]]
     name = _new_name(scene, body) if match["name"] is None else match["name"]
     name = json.loads(name) if name.startswith('"') else name
+    name = scene.names[int(name[1:])] if re.fullmatch(r"@\d+", name) else name
     place = (match["place"] or "").lower()
     if place.startswith(("at", "to")):
         where = vector(match, 4)
