@@ -15,6 +15,7 @@ from mjx_refine.effects import acting
 from mjx_refine.scene import Shape
 from mjx_refine.sim.carried import carried, refuse_loads
 from mjx_refine.sim.colliders import installed
+from mjx_refine.sim.devices import Devices
 from mjx_refine.sim.leaves import Leaves, candidate_model, leaves_of
 from mjx_refine.sim.mjx_import import mjx
 from mjx_refine.sim.model import SUBSTEPS, build_spec, initial_state
@@ -28,10 +29,10 @@ def bucket(count: int) -> int:
     return next((size for size in BUCKETS if size >= count), -(-count // BUCKETS[-1]) * BUCKETS[-1])
 
 
-def padded(batch: SceneBatch) -> SceneBatch:
-    """``batch`` with its last candidate repeated up to the next bucket."""
-    rows = np.minimum(np.arange(bucket(len(batch))), len(batch) - 1)
-    return batch[rows]
+def padded(batch: SceneBatch, multiple: int = 1) -> SceneBatch:
+    """``batch`` with its last candidate repeated up to the next bucket, rounded up to a ``multiple``."""
+    size = -(-bucket(len(batch)) // multiple) * multiple
+    return batch[np.minimum(np.arange(size), len(batch) - 1)]
 
 
 def diverged_to_nan(poses: Float[np.ndarray, "batch frames objects 7"]) -> Float[np.ndarray, "batch frames objects 7"]:
@@ -42,7 +43,7 @@ def diverged_to_nan(poses: Float[np.ndarray, "batch frames objects 7"]) -> Float
 
 
 class MjxSimulator:
-    """Batched rollouts in MJX-JAX.
+    """Batched rollouts in MJX-JAX, the candidates dealt out to all devices.
 
     Args:
       shapes: the scene kind.
@@ -50,6 +51,7 @@ class MjxSimulator:
       iterations: Newton iterations a step (1 is unsound with six-dimensional contacts).
       ls_iterations: line-search iterations a Newton iteration.
       off_centre: for centres of mass that are not at the bodies' centres.
+      devices: that compute; by default all local ones.
     """
 
     name = "mjx"
@@ -61,11 +63,13 @@ class MjxSimulator:
         iterations: int = 20,
         ls_iterations: int = 20,
         off_centre: bool = False,
+        devices: Devices | None = None,
     ):
         self.shapes = shapes
         self.fps = fps
-        self._beside = functools.cache(lambda: MjxSimulator(shapes, fps, iterations, ls_iterations, True))
-        self.device = jax.devices()[0].platform
+        self.devices = devices or Devices()
+        self._beside = functools.cache(lambda: MjxSimulator(shapes, fps, iterations, ls_iterations, True, self.devices))
+        self.device = self.devices.name
         model = build_spec(shapes, fps, off_centre=off_centre).compile()
         # Single precision cannot reach the default of 1e-8: the solver would iterate on rounding noise, in flight too.
         model.opt.tolerance = 1e-6
@@ -108,7 +112,7 @@ class MjxSimulator:
         size = len(arguments[1])
         if (size, frames) not in self._programs:
             with compiling(f"MJX-JAX physics of {'+'.join(self.shapes)}, {size} candidates, {frames} frames"):
-                program = jax.jit(jax.vmap(functools.partial(self.trajectory, frames=frames)))
+                program = jax.jit(self.devices.spread(jax.vmap(functools.partial(self.trajectory, frames=frames))))
                 self._programs[size, frames] = program.lower(*arguments).compile()
         return self._programs[size, frames]
 
@@ -142,8 +146,8 @@ class MjxSimulator:
         return carried(batch, frames, lambda inside, needed, _: simulator._rollout(inside, needed))
 
     def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
-        full = padded(batch)
+        full = padded(batch, len(self.devices))
         qpos, qvel = initial_state(full)
-        arguments = (leaves_of(full), jnp.asarray(qpos), jnp.asarray(qvel))
+        arguments = self.devices.dealt((leaves_of(full), jnp.asarray(qpos), jnp.asarray(qvel)))
         poses = self._program(arguments, frames)(*arguments)
         return diverged_to_nan(np.asarray(poses, np.float64)[: len(batch)])

@@ -1,0 +1,51 @@
+"""All local devices as one: the candidates of a batch are dealt out to them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+AXIS = "candidates"
+
+
+class Devices:
+    """A row of devices, each of which computes an equal part of a batch.
+
+    Args:
+      devices: by default all local devices of JAX's default backend.
+    """
+
+    def __init__(self, devices: Sequence[jax.Device] | None = None):
+        self.devices = tuple(jax.local_devices() if devices is None else devices)
+        self._mesh = Mesh(np.array(self.devices), (AXIS,))
+
+    def __len__(self) -> int:
+        return len(self.devices)
+
+    @property
+    def name(self) -> str:
+        """The platform, with the number of devices where there are several: ``gpu``, ``4 x gpu``."""
+        platform = self.devices[0].platform
+        return platform if len(self) == 1 else f"{len(self)} x {platform}"
+
+    def dealt(self, tree: Any) -> Any:
+        """``tree`` with the leading axis of every array, a multiple of the number of devices, split over the devices."""
+        if len(self) == 1:
+            return tree
+        return jax.device_put(tree, NamedSharding(self._mesh, PartitionSpec(AXIS)))
+
+    def spread(self, function: Callable) -> Callable:
+        """``function`` of batches and to a batch, run by each device on its own part.
+
+        Each device is then its own program: a solver's loop ends where the device's candidates have converged, not where
+        all have, and no device waits for another before the end.
+        """
+        if len(self) == 1:
+            return function
+        one = PartitionSpec(AXIS)
+        # The model's constants are the same everywhere, and become a candidate's own inside loops.
+        return jax.shard_map(function, mesh=self._mesh, in_specs=one, out_specs=one, check_vma=False)
