@@ -43,8 +43,8 @@ def refine_many_command(
     many = refine_many(todo, Options(**options), out=out, progress=many_display(), **how)
     print_table(many)
     if many.status == 2:
-        more = f" (and {len(many.outcomes) - 1} more jobs with errors)" if len(many.outcomes) > 1 else ""
-        raise InputError(many.outcomes[0].reason + more)
+        reasons = [outcome.reason for outcome in many.outcomes]
+        raise InputError(reasons[0] + (f" (and {len(reasons) - 1} more jobs with errors)" if reasons[1:] else ""))
     if many.status:
         raise click.exceptions.Exit(many.status)
 

@@ -65,7 +65,8 @@ def refine_many(
       options: of all jobs; a job's overrides come before them.
       out: folder; a job writes in ``out / job.name`` what a refinement writes, and ``summary.csv`` has a row a job.
       workers: processes with one thread each; by default the cores with C MuJoCo, one with MJX. A script that calls
-        this needs ``if __name__ == "__main__":``, since each process imports it. With ``ray``: jobs at once, at most.
+        this needs ``if __name__ == "__main__":``, since each process imports it. With
+        ``ray``: cores of a cluster that is made here.
       resume: leave finished jobs alone and go on with unfinished ones from their checkpoints; jobs whose clip, samples
         or options are others than then begin anew.
       engine: ``processes`` of this machine, or ``ray``.

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from many_clips import job_of, tiny_clip
 
-from mjx_refine.cli.many import told
 from mjx_refine.cli.main import run
+from mjx_refine.cli.many import told
 from mjx_refine.errors import InputError
 from mjx_refine.many import Job, jobs_of_pairs, load_jobs
 from mjx_refine.many.groups import Waiting, kind_of_job
@@ -34,9 +34,7 @@ def test_a_jobs_file(tmp_path):
     assert first == Job(tmp_path / "a/best32.yaml", tmp_path / "a/flows.npz", "a")
     assert second.name == "throw"
     assert second.video == Path("/data/throw.npz")
-    assert second.options(Options(population=9)) == Options(
-        population=9, seed=7, iterations=12, resolution=(96, 64)
-    )
+    assert second.options(Options(population=9)) == Options(population=9, seed=7, iterations=12, resolution=(96, 64))
     assert third.name == "third"
     assert third.init == Path("/data/c.yaml")
     assert third.options(Options()).optimizer == "cmaes"
@@ -126,7 +124,13 @@ def test_a_worker_keeps_to_its_kind_then_takes_one_that_nobody_works_on():
     waiting.put_back(*taken[-1])
     taken[-1] = waiting.take("x", ["y"])
     taken.append(waiting.take("z", ["y", "z"]))
-    assert [(job.name, kind) for job, kind in taken] == [("x1", "x"), ("y1", "y"), ("x2", "x"), ("z1", "z"), ("y2", "y")]
+    assert [(job.name, kind) for job, kind in taken] == [
+        ("x1", "x"),
+        ("y1", "y"),
+        ("x2", "x"),
+        ("z1", "z"),
+        ("y2", "y"),
+    ]
     assert len(waiting) == 0
 
 
