@@ -13,6 +13,9 @@ NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?"
 AMOUNT = rf"({NUMBER}) ?([a-zµ°%][\w/^²°]*(?: per \w+)?)?"
 VECTOR = rf"[\[(] ?({NUMBER}) ?, ?({NUMBER}) ?, ?({NUMBER}) ?[\])]"
 
+MOST = 1e9
+"""Numbers in instructions go so far."""
+
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "metres": 1.0, "meters": 1.0, "metre": 1.0, "meter": 1.0}
 _ANGLES = {"degrees": 1.0, "degree": 1.0, "deg": 1.0, "°": 1.0}
 UNITS: dict[str, dict[str, float]] = {
@@ -62,6 +65,8 @@ def quantity(text: str, unit: str | None, dimension: str) -> float:
     Raises:
       InputError: the unit is of something else.
     """
+    if not abs(float(text)) <= MOST:
+        raise InputError(f"instruction: {text}; expected a number up to {MOST:g}; lower it")
     if unit is None:
         return float(text)
     known = UNITS[dimension]
@@ -108,13 +113,13 @@ def _to(target: float) -> Change:
 
 
 def _scaled(factor: float, inverse: bool) -> Change:
-    if factor <= 0:
-        raise InputError(f"instruction: a factor of {factor:g}; expected one above 0; correct it")
+    if not 1 / MOST <= factor <= MOST:
+        raise InputError(f"instruction: a factor of {factor:g}; expected one above 0 and up to {MOST:g}; correct it")
     return lambda value: value / factor if inverse else value * factor
 
 
 def _percentage(verb: str, word: str, percent: float) -> Change | None:
-    if percent < 0 or (verb in DOWN and word == "by" and percent > 100):
+    if not 0 <= percent <= MOST or (verb in DOWN and word == "by" and percent > 100):
         raise InputError(
             f"instruction: {verb} {word} {percent:g}%; expected 0 to {'100' if verb in DOWN else 'any'} percent; correct it"
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from collections.abc import Iterator
 
@@ -152,6 +153,8 @@ def content_end(node: yaml.Node) -> int:
 
 def number_text(value: float, like: str = "") -> str:
     """A number with at most twelve digits and places, as YAML reads it; whole where ``like`` is written whole and it is."""
+    if not math.isfinite(value):
+        raise InputError(f"instruction: a number became {value:g}; expected a finite one; lower the amount")
     # What sines leave of a zero is a zero.
     short = 0.0 if abs(value) < 1e-12 else float(f"{value:.12g}")
     if _INTEGER.fullmatch(like) and short == int(short):

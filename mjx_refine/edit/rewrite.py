@@ -177,7 +177,9 @@ def with_copy(document: Document, name: str, new: str) -> str:
     """
     index = document.scene.names.index(name)
     node = document.object_nodes()[index]
-    shown = new if _PLAIN_NAME.fullmatch(new) and new.lower() not in _YAML_WORDS else json.dumps(new)
+    shown = (
+        new if _PLAIN_NAME.fullmatch(new) and new.lower() not in _YAML_WORDS else json.dumps(new, ensure_ascii=False)
+    )
     flow = bool(document.root.flow_style)
     start, end = (node.start_mark.index, node.end_mark.index) if flow else _block_span(document, node)
     if any(id(child) in document.shared for child in _inside(node)):
@@ -186,7 +188,7 @@ def with_copy(document: Document, name: str, new: str) -> str:
         )
     named = find(node, "name")
     if isinstance(named, yaml.ScalarNode) and named.style == '"':
-        shown = json.dumps(new)
+        shown = json.dumps(new, ensure_ascii=False)
     text = document.yaml[start:end]
     if named is None:
         first = node.value[0][0].start_mark

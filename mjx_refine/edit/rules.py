@@ -74,7 +74,7 @@ def each(scene: Scene, match: re.Match[str], make: Callable[[Body], Body]) -> St
 
 def vector(match: re.Match[str], start: int) -> tuple[float, float, float]:
     """The three numbers of the ``VECTOR`` whose first group is ``start``."""
-    x, y, z = (float(match[start + k]) for k in range(3))
+    x, y, z = (quantity(match[start + k], None, "") for k in range(3))
     return x, y, z
 
 
@@ -227,7 +227,7 @@ def _times_as(scene: Scene, match: re.Match[str]) -> Step:
     factor = {"twice": 2.0, "half": 0.5, "thrice": 3.0}[match["times"].lower()] if match["times"] else float(match["n"])
     name, sign = _adjective(match["word"].lower())
     item = quantity_called(name)
-    if factor <= 0:
+    if not 1 / amounts.MOST <= factor <= amounts.MOST:
         raise InputError(f"instruction: {factor:g} times as {match['word']}; expected a factor above 0; correct it")
     return each(scene, match, lambda body: item.put(body, item.get(body) * factor**sign))
 

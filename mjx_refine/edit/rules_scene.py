@@ -77,7 +77,7 @@ def _copy(scene: Scene, match: re.Match[str]) -> Step:
         raise InputError("instruction: copies of several objects at once; expected one object; write one after another")
     body = scene.objects[which[0]]
     name = _new_name(scene, body) if match["name"] is None else match["name"]
-    name = json.loads(name) if name.startswith('"') else name
+    name = _unquoted(name) if name.startswith('"') else name
     name = scene.names[int(name[1:])] if re.fullmatch(r"@\d+", name) else name
     place = (match["place"] or "").lower()
     if place.startswith(("at", "to")):
@@ -91,6 +91,15 @@ def _copy(scene: Scene, match: re.Match[str]) -> Step:
         reach = max(geom_size(body)) if body.shape == "sphere" else math.hypot(*geom_size(body))
         where = _moved(body, (round(2 * reach + 0.1, 2), 0.0, 0.0)).position
     return Step(scene, (name,), (), (body.name, name, lambda copy: dataclasses.replace(copy, position=where)))
+
+
+def _unquoted(text: str) -> str:
+    try:
+        return str(json.loads(text))
+    except ValueError as error:
+        raise InputError(
+            f"instruction: the name {text} is not readable ({error}); expected a quoted text; correct it"
+        ) from error
 
 
 def _new_name(scene: Scene, body: Body) -> str:
@@ -188,7 +197,7 @@ def _zoom(scene: Scene, match: re.Match[str]) -> Step:
     """The picture of everything grows, or shrinks, by so much: the focal length does."""
     percent = float(match[2])
     factor = 1 + percent / 100 if match["way"].lower() == "in" else 1 - percent / 100
-    if factor <= 0:
-        raise InputError(f"instruction: zoom out by {percent:g}%; expected less than 100%; lower it")
+    if not 1 / amounts.MOST <= factor <= amounts.MOST:
+        raise InputError(f"instruction: zoom {match['way']} by {percent:g}%; expected less than 100% out; lower it")
     half = math.atan(math.tan(math.radians(scene.camera.fovy) / 2) / factor)
     return _with_camera(scene, fovy=math.degrees(2 * half))

@@ -42,7 +42,7 @@ def clauses(instruction: str, names: tuple[str, ...]) -> list[str]:
         quoted.append(match[0])
         return f"\x00{len(quoted) - 1}\x00"
 
-    text = re.sub(r"[\[(][^\])]*[\])]", keep, _QUOTED.sub(keep, instruction.strip()))
+    text = re.sub(r"[\[(][^\])]*[\])]", keep, _QUOTED.sub(keep, instruction.replace("\x00", " ").strip()))
     parts, joints, at = [], [""], 0
     for match in _JOINTS.finditer(text):
         parts.append(text[at : match.start()])

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 from edit_cases import EDITS, REFUSED, TEXT
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 
 from mjx_refine.cli.main import run
@@ -249,6 +251,29 @@ def test_odd_names_are_named_in_quotation_marks():
     assert body(result.after, "no: 1").mass == 4.0
     with pytest.raises(NotUnderstoodError):
         edit(text, "double the mass of @1")
+
+
+VOCABULARY = """
+make set reduce double copy remove move launch spin turn zoom tilt raise lower scale reverse stop use the a as of to by at
+about and ; , . its it box_0 can ball everything camera gravity mass speed x-velocity size radius height friction bounce
+damping field view position left right up down z m m/s kg degrees moon twice heavy faster times factor 2 -3 0.5 80% 1e999
+1e-320 nan 100% [1,2,3] [1e999,0,0] [1,2 @0 @9 'x NUMBER OBJECT éß ٣ "can" "a "\\q"
+"""
+WORDS = [*VOCABULARY.split(), "\n", "\x00", "\x000\x00"]
+
+
+@settings(max_examples=400)
+@given(st.one_of(
+    st.lists(st.sampled_from(WORDS), min_size=1, max_size=12).map(" ".join),
+    st.tuples(st.sampled_from([name for name, _ in EDITS]), st.sampled_from(WORDS), st.integers(0, 11)).map(
+        lambda told: " ".join([w if k != told[2] else told[1] for k, w in enumerate(told[0].split())])),
+))  # fmt: skip
+def test_any_words_make_a_sound_scene_or_are_refused(instruction):
+    try:
+        result = edit(TEXT, instruction)
+    except InputError:
+        return
+    assert parse_scenes(result.after)[0] == result.scene
 
 
 @pytest.fixture
