@@ -19,7 +19,7 @@ from mjx_refine.many.groups import Kind, Waiting
 from mjx_refine.many.jobs import Job
 from mjx_refine.many.outcome import FAILED, Outcome
 from mjx_refine.many.progress import ManyProgress
-from mjx_refine.many.work import one_thread, work
+from mjx_refine.many.work import ONE_THREAD, work
 from mjx_refine.search import Options
 from mjx_refine.sim.backends import resolve_backend
 
@@ -131,7 +131,8 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, out, options, single), daemon=True)
-        self.process.start()
+        with _environment(ONE_THREAD if single else {}):
+            self.process.start()
         theirs.close()
         self.job: Job | None = None
         self.kind: Kind | None = None
@@ -151,6 +152,18 @@ class _Worker:
         return _how(self.process.exitcode)
 
 
+@contextlib.contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    """This process's environment with ``values`` for a while, for a child to inherit; what the user has set stays."""
+    added = [name for name in values if name not in os.environ]
+    os.environ.update({name: values[name] for name in added})
+    try:
+        yield
+    finally:
+        for name in added:
+            os.environ.pop(name, None)
+
+
 def _how(code: int | None) -> str:
     if code is None or code >= 0:
         return f"exit status {code}"
@@ -166,7 +179,6 @@ def _serve(pipe: Any, out: Path, options: Options, single: bool) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends us
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if single:
-        one_thread()
         options = dataclasses.replace(options, threads=options.threads or 1)
     with contextlib.suppress(EOFError, OSError):
         try:

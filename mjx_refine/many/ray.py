@@ -16,7 +16,7 @@ from mjx_refine.many.groups import Kind
 from mjx_refine.many.jobs import Job
 from mjx_refine.many.outcome import FAILED, Outcome
 from mjx_refine.many.progress import ManyProgress
-from mjx_refine.many.work import one_thread, work
+from mjx_refine.many.work import ONE_THREAD, work
 from mjx_refine.search import Options
 
 RETRIES = 3
@@ -65,7 +65,8 @@ def ray_outcomes(
 
 def _outcomes(ray: Any, jobs: list[tuple[Job, Kind]], out: Path, options: Options, progress) -> Iterator[Outcome]:
     kinds = list(dict.fromkeys(kind for _, kind in jobs))
-    task, how = ray.remote(_task), {"max_retries": RETRIES, **_needs(options, ray.cluster_resources())}
+    task, needs = ray.remote(_task), _needs(options, ray.cluster_resources())
+    how = {"max_retries": RETRIES, "runtime_env": {"env_vars": ONE_THREAD}, **needs}
     pending = {}
     for job, _ in sorted(jobs, key=lambda pair: kinds.index(pair[1])):
         pending[task.options(name=job.name, **how).remote(_absolute(job), out, options)] = job.name
@@ -91,7 +92,6 @@ def _outcome(ray: Any, reference: Any, name: str) -> Outcome:
 
 def _task(job: Job, out: Path, options: Options) -> Outcome:
     """One job. A retry finds its checkpoint, or the finished result, and goes on from there."""
-    one_thread()
     return work(job, out, dataclasses.replace(options, threads=options.threads or 1))
 
 

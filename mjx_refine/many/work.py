@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import time
 import traceback
 from collections.abc import Callable
@@ -28,16 +27,14 @@ SEARCHING = 0.8
 SECONDS = 0.5
 """Between two messages about a job's progress."""
 
-_ONE_THREAD = {
+ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
 }
-
-
-def one_thread() -> None:
-    """Lets this process compute with one thread; before JAX has computed anything. What the user has set stays."""
-    for name, value in _ONE_THREAD.items():
-        os.environ.setdefault(name, value)
+"""Environment of a process that computes with one thread, read when numpy is imported and JAX begins: several processes
+whose linear algebra has a thread for every core wait for one another ten times as long as they compute."""
 
 
 def work(job: Job, out: Path, common: Options, told: Callable[[float], object] = lambda part: None) -> Outcome:

@@ -19,7 +19,7 @@ class Devices:
       devices: by default all local devices of JAX's default backend.
     """
 
-    def __init__(self, devices: Sequence[jax.Device] | None = None):
+    def __init__(self, devices: Sequence[Any] | None = None):
         self.devices = tuple(jax.local_devices() if devices is None else devices)
         self._mesh = Mesh(np.array(self.devices), (AXIS,))
 

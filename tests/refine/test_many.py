@@ -12,11 +12,9 @@ from pathlib import Path
 import pytest
 from many_clips import TINY, TINY_CALL, job_of, tiny_clip
 
-from mjx_refine import load_observation, load_scenes, refine
 from mjx_refine.cli.main import run
 from mjx_refine.many import Job, ManyProgress, refine_many
-from mjx_refine.many.work import work
-from mjx_refine.report import write_result
+from mjx_refine.many.work import ONE_THREAD, work
 
 FILES = ["checkpoint.npz", "history.csv", "overlay.gif", "refined.yaml", "report.html", "result.json"]
 
@@ -24,27 +22,29 @@ FILES = ["checkpoint.npz", "history.csv", "overlay.gif", "refined.yaml", "report
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory) -> list[Path]:
     folder = tmp_path_factory.mktemp("clips")
-    return [tiny_clip(folder / name, shift) for name, shift in (("a", 0.0), ("b", 0.2), ("c", -0.2))]
+    return [tiny_clip(folder / name, shift) for name, shift in (("a", 0.0), ("b", 0.2))]
 
 
 @pytest.fixture(scope="module")
 def whole(clips, tmp_path_factory):
-    """All clips refined, with two jobs among them that cannot be: (folder, what ``refine_many`` returned)."""
+    """Both clips refined, with two jobs among them that cannot be: (folder, what ``refine_many`` returned)."""
     out = tmp_path_factory.mktemp("whole")
     (out / "damaged.npz").write_bytes(b"PK\3\4")
     (out / "scene.yaml").write_text("- {type: cone}")
-    jobs = [job_of(clips[0]), Job(clips[0] / "best32.yaml", out / "damaged.npz"), *map(job_of, clips[1:])]
+    jobs = [job_of(clips[0]), Job(clips[0] / "best32.yaml", out / "damaged.npz"), job_of(clips[1])]
     jobs += [Job(out / "scene.yaml", clips[0] / "flows.npz", "cone")]
     return out, jobs, refine_many(jobs, TINY, out=out, workers=2)
 
 
 def test_each_clip_is_refined_as_if_it_were_alone(whole, clips, tmp_path):
     out, _, _ = whole
-    samples, observation = load_scenes(clips[1] / "best32.yaml"), load_observation(clips[1] / "flows.npz")
     alone = tmp_path / "alone"
-    write_result(alone, refine(samples, observation, TINY, folder=alone), observation)
+    pair = ["--init", str(clips[1] / "best32.yaml"), "--video", str(clips[1] / "flows.npz")]
+    # With one thread, as each of several has: the order of sums, so the last digits, depends on their number.
+    process = call(*pair, "--out", str(alone), *TINY_CALL, environment=ONE_THREAD)
+    assert process.communicate(timeout=300)[1] == ""
     assert sorted(os.listdir(alone)) == FILES
-    for name in ("a", "b", "c"):
+    for name in ("a", "b"):
         assert sorted(os.listdir(out / name)) == FILES
     for name in ("refined.yaml", "overlay.gif"):
         assert (out / "b" / name).read_bytes() == (alone / name).read_bytes()
@@ -57,16 +57,15 @@ def test_what_cannot_be_refined_stops_no_other(whole):
         ("a", "done"),
         ("damaged", "bad input"),
         ("b", "done"),
-        ("c", "done"),
         ("cone", "bad input"),
     ]
     assert "damaged.npz: not a readable npz" in many.outcomes[1].reason
-    assert "entry 0.type = 'cone'" in many.outcomes[4].reason
+    assert "entry 0.type = 'cone'" in many.outcomes[3].reason
     assert many.status == 1
     assert not (out / "cone").exists()
     with open(out / "summary.csv") as stream:
         rows = {row["name"]: row for row in csv.DictReader(stream)}
-    assert list(rows) == ["a", "damaged", "b", "c", "cone"]
+    assert list(rows) == ["a", "damaged", "b", "cone"]
     assert float(rows["b"]["iou_after"]) > float(rows["b"]["iou_before"]) > 0.3
     assert float(rows["b"]["fitness_after"]) == pytest.approx(
         float(rows["b"]["iou_after"]) - float(rows["b"]["epe_after"]), abs=0.3
@@ -76,13 +75,12 @@ def test_what_cannot_be_refined_stops_no_other(whole):
 
 def test_finished_clips_are_skipped_and_changed_ones_begin_anew(whole, clips):
     out, _, _ = whole
-    before = {path: path.stat().st_mtime_ns for path in out.glob("[abc]/*")}
-    jobs = [job_of(clips[0]), job_of(clips[1], seed=4), job_of(clips[2])]
-    outcomes = [work(job, out, TINY) for job in jobs]
-    assert [outcome.status for outcome in outcomes] == ["skipped", "done", "skipped"]
+    before = {path: path.stat().st_mtime_ns for path in out.glob("[ab]/*")}
+    outcomes = [work(job, out, TINY) for job in (job_of(clips[0]), job_of(clips[1], seed=4))]
+    assert [outcome.status for outcome in outcomes] == ["skipped", "done"]
     assert "begun anew" in outcomes[1].reason
     assert outcomes[0].iou_after is not None
-    after = {path: path.stat().st_mtime_ns for path in out.glob("[abc]/*")}
+    after = {path: path.stat().st_mtime_ns for path in out.glob("[ab]/*")}
     assert {path.parent.name for path in before if before[path] != after[path]} == {"b"}
 
 
@@ -101,9 +99,9 @@ class Killer(ManyProgress):
 
 def test_a_worker_that_is_killed_costs_its_clip_alone(clips, tmp_path):
     killer = Killer(tmp_path)
-    many = refine_many([job_of(clips[0]), job_of(clips[2])], TINY, out=tmp_path, workers=1, progress=killer)
+    many = refine_many([job_of(clips[0]), job_of(clips[1])], TINY, out=tmp_path, workers=1, progress=killer)
     assert killer.victim == "a"
-    assert [(outcome.name, outcome.status) for outcome in many.outcomes] == [("a", "failed"), ("c", "done")]
+    assert [(outcome.name, outcome.status) for outcome in many.outcomes] == [("a", "failed"), ("b", "done")]
     assert "killed by SIGKILL" in many.outcomes[0].reason
     assert many.status == 1
     assert multiprocessing.active_children() == []
@@ -112,17 +110,21 @@ def test_a_worker_that_is_killed_costs_its_clip_alone(clips, tmp_path):
     assert not (tmp_path / "a/result.json").exists()
 
 
-def call(*arguments: str) -> subprocess.Popen:
+def call(*arguments: str, environment: dict[str, str] | None = None) -> subprocess.Popen:
     path = os.pathsep.join(os.path.abspath(entry or ".") for entry in sys.path)
     program = [sys.executable, "-c", "from mjx_refine.cli import main; main()", *arguments]
     return subprocess.Popen(
-        program, env={**os.environ, "PYTHONPATH": path}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        program,
+        env={**os.environ, "PYTHONPATH": path, **(environment or {})},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
 
 
 def test_a_whole_that_is_killed_goes_on_to_the_same_bytes(clips, tmp_path, whole):
     (tmp_path / "jobs.yaml").write_text(
-        "".join(f"- {{init: {clip}/best32.yaml, video: {clip}/flows.npz}}\n" for clip in clips[::2])
+        "".join(f"- {{init: {clip}/best32.yaml, video: {clip}/flows.npz}}\n" for clip in clips[:1])
     )
     out = tmp_path / "out"
     arguments = ["--jobs", str(tmp_path / "jobs.yaml"), "--out", str(out), "--workers", "2", *TINY_CALL]
@@ -139,18 +141,17 @@ def test_a_whole_that_is_killed_goes_on_to_the_same_bytes(clips, tmp_path, whole
     second = call(*arguments, "--resume")
     said, errors = second.communicate(timeout=300)
     assert (second.returncode, errors) == (0, "")
-    assert "2 done" in said
-    assert [line.split()[:2] for line in said.splitlines()[1:3]] == [["a", "done"], ["c", "done"]]
-    for name in ("a", "c"):
-        assert sorted(os.listdir(out / name)) == FILES
+    assert "1 done" in said
+    assert said.splitlines()[1].split()[:2] == ["a", "done"]
+    assert sorted(os.listdir(out / "a")) == FILES
     assert (out / "a/refined.yaml").read_bytes() == (whole[0] / "a/refined.yaml").read_bytes()
 
 
 def test_the_command_ends_with_1_where_a_clip_failed_and_2_where_all_were_bad(whole, clips, tmp_path, capsys):
     out = whole[0]
-    good, bad = str(clips[2] / "best32.yaml"), str(tmp_path / "none.yaml")
-    pair = ["--init", good, "--video", str(clips[2] / "flows.npz")]
-    broken = ["--init", bad, "--video", str(clips[0] / "flows.npz")]
+    good, bad = str(clips[0] / "best32.yaml"), str(tmp_path / "none.yaml")
+    pair = ["--init", good, "--video", str(clips[0] / "flows.npz")]
+    broken = ["--init", bad, "--video", str(clips[1] / "flows.npz")]
     assert run([*pair, *broken, "--out", str(out), *TINY_CALL, "--workers", "1", "--resume"]) == 1
     shown = capsys.readouterr()
     assert shown.err == ""
