@@ -29,13 +29,14 @@ def exponential(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*ba
 
 def matrix(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotation matrices of unit quaternions."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    result = np.empty((*q.shape[:-1], 3, 3), q.dtype)
+    result[..., 0, 0] = 1 - 2 * (y * y + z * z)
+    result[..., 1, 1] = 1 - 2 * (x * x + z * z)
+    result[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    for i, j, product, turn in ((0, 1, x * y, w * z), (1, 2, y * z, w * x), (2, 0, x * z, w * y)):
+        result[..., i, j], result[..., j, i] = 2 * (product - turn), 2 * (product + turn)
+    return result
 
 
 def rotate(q: Float[np.ndarray, "*batch 4"], v: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:

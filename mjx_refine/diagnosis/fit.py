@@ -9,22 +9,16 @@ from jaxtyping import Bool, Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.measure import Measured
+from mjx_refine.diagnosis.measure import Measured, Parts
+from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, settled
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.slack import Slack, impacts, kicked, slack_of
-from mjx_refine.search.features import DIRECTIONS
 from mjx_refine.search.landing import slowed
 from mjx_refine.sim.backends import Simulator
 
-EDGE_COUNT, FLOW_COUNT, BACKGROUND_COUNT = 6.0, 3.0, 6.0
-"""As how many independent numbers the directions of one outline, the flow of one mask (each axis) and that of the
-background (each axis) count in one frame, since neighbours err together; the first two until they are measured."""
-
-EDGE_COUNTS, FLOW_COUNTS = (4.0, 12.0), (1.5, 10.0)
-"""Bounds of these counts where they are measured."""
-
-STEP, EFFECT_STEP = 0.4, 0.1
-"""Of finite differences, in prior widths: of base parameters and of effects'."""
+STEPS = (0.002, 0.02, 0.2)
+"""Of finite differences, in prior widths: the first follows what is smooth, the others see over the jags of contacts, and
+are tried where it leads no further."""
 
 TAIL = 2.0
 """Prior widths beyond which moving a base parameter costs ever less: half its price is TAIL^2 log(1 + (z / TAIL)^2)."""
@@ -34,24 +28,9 @@ DAMPINGS = np.array([0.03, 0.3, 1.0, 10.0, 100.0])
 SCALE = 5.0
 """Noise widths beyond which residuals count ever less."""
 
+PATIENCE = Parts(1.0, 1.0, 6.0, 1.0)
+"""The same for each kind of measurement, in multiples: a centroid is either of the whole mask or not measured at all."""
 
-@dataclasses.dataclass(frozen=True)
-class Noise:
-    """Standard deviations [px].
-
-    Attributes:
-      edge: of outlines.
-      flow: of the objects' flow.
-      background: of the flow beside them.
-    """
-
-    edge: Float[np.ndarray, "frames objects"]
-    flow: Float[np.ndarray, "intervals objects"]
-    background: float
-
-
-LEAST_EDGE = 0.12
-"""Noise of outlines that is assumed at least [px]."""
 
 DRAWS = 12
 """Pairs of rollouts that measure chaos."""
@@ -91,33 +70,6 @@ class Fit:
         return self.jacobian.T @ self.jacobian + np.diag(prior(self.hypothesis, self.z)[1] ** 2)
 
 
-def _everywhere(measured: Measured, frames: int) -> Noise:
-    """The same noise in every frame."""
-    return Noise(
-        np.repeat(measured.edge_noise[None], frames, 0),
-        np.repeat(measured.flow_noise[None], frames - 1, 0),
-        measured.background_noise,
-    )
-
-
-def _independent(steps: np.ndarray) -> float:
-    """As how many independent numbers the last axis counts: its length over the sum of its mean correlations."""
-    count = steps.shape[-1]
-    rows = steps.reshape(-1, count)
-    rows = rows[(rows != 0).all(1)]
-    if len(rows) < 10:
-        return float(count) / 3
-    # A few wild rows would speak for all.
-    rows = rows / np.maximum(np.sqrt((rows**2).mean(1, keepdims=True)), 1e-12)
-    return count / max(float((rows.sum(1) ** 2).mean()) / count, 1e-6)
-
-
-def _middle(values: np.ndarray) -> float:
-    """Median of what is finite; one where nothing is."""
-    values = values[np.isfinite(values)]
-    return float(np.median(values)) if len(values) else 0.455
-
-
 def prior(hypothesis: Hypothesis, z: Float[np.ndarray, "*batch dimension"]) -> tuple[np.ndarray, np.ndarray]:
     """The prior as residuals, and their derivatives in z: heavy-tailed for base parameters, normal for effects'."""
     heavy = hypothesis.ordinary
@@ -142,10 +94,10 @@ class ClipFit:
         self, simulator: Simulator, measured: Measured, image: tuple[int, int], frames: int, noise: Noise | None = None
     ):
         self.simulator, self.measured, self.image, self.frames = simulator, measured, image, frames
-        self.noise = noise or _everywhere(measured, frames)
+        self.noise = noise or everywhere(measured, frames)
         self.predictor = Predictor(simulator.shapes, measured.pixels, measured.places, image, simulator.fps)
         self.rollouts = 0.0
-        self.edge_count, self.flow_count = EDGE_COUNT, FLOW_COUNT
+        self.counts = Counts()
         self._columns: np.ndarray | None = None
         self._slacks: dict[bytes | None, Slack] = {}
 
@@ -165,36 +117,17 @@ class ClipFit:
         moved, still = self.predictor(rows, many), self.predictor(poses[None], batch)
         parts = [
             np.where(np.isfinite(measured)[None], np.nan_to_num(a - b), 0.0)
-            for a, b, measured in (
-                (moved.reach, still.reach, self.measured.reach),
-                (moved.flow, still.flow, self.measured.flow),
-                (moved.background, still.background, self.measured.background),
-            )
+            for a, b, measured in zip(moved.parts, still.parts, self.measured.parts, strict=True)
         ]
-        columns = self.whitened((parts[0], parts[1], parts[2]), None, 1e9)
+        self.noise = blurred(self.noise, still.moments[0], [(i.target, i.frame) for i in found])
+        columns = self.whitened(Parts(*parts), None, 1e9)
         self._columns = columns[~moved.bad].T
         return len(found)
 
     def settle_noise(self, fit: Fit) -> None:
         """Sets the noise to what changes from frame to frame in the residuals of a fit, which no smooth misfit does."""
-        m = self.measured
-        a, b = m.reach.size, m.reach.size + m.flow.size
-        reach, flow = fit.residual[:a].reshape(m.reach.shape), fit.residual[a:b].reshape(m.flow.shape)
-
-        def rough(series: np.ndarray, measured: np.ndarray, share: float) -> np.ndarray:
-            step = np.where(np.isfinite(measured), series, np.nan)
-            square = np.diff(step, axis=0) ** 2 / 2 / share
-            return np.array([np.sqrt(_middle(square[:, n]) / 0.455) for n in range(series.shape[1])])
-
-        edge = np.clip(rough(reach, m.reach, self.edge_count / DIRECTIONS), 0.4, 1.5)
-        moved = np.clip(rough(flow, m.flow, self.flow_count / m.flow.shape[-2]), 0.7, 3.0)
-        self.edge_count = float(np.clip(_independent(np.diff(reach, axis=0)), *EDGE_COUNTS))
-        told = float(np.clip(_independent(np.moveaxis(np.diff(flow, axis=0), -1, -2)), *FLOW_COUNTS))
-        # Flow whose noise is not stated was measured, and errs smoothly in time as well.
-        self.flow_count = told if m.stated else min(told, FLOW_COUNTS[0])
-        edge, moved = m.edge_noise * edge, m.flow_noise * moved
-        self.measured = dataclasses.replace(m, edge_noise=np.maximum(edge, LEAST_EDGE), flow_noise=moved)
-        self.noise = _everywhere(self.measured, self.frames)
+        self.measured, self.counts = settled(self.measured, self.measured.split(fit.residual), self.counts)
+        self.noise = everywhere(self.measured, self.frames)
 
     def allow_chaos(self, fit: Fit, seed: int) -> None:
         """Adds the rollout's own jaggedness around a fit to the noise.
@@ -215,8 +148,12 @@ class ClipFit:
             return np.sqrt(np.median(square.reshape(*square.shape[:3], -1).mean(-1), axis=0) / 2.0)
 
         m = self.measured
+        second = np.moveaxis([bend(told.moments[..., k : k + 1]) for k in range(3)], 0, -1)
         self.noise = Noise(
-            np.hypot(m.edge_noise, bend(told.reach)), np.hypot(m.flow_noise, bend(told.flow)), self.noise.background
+            np.hypot(m.edge_noise, bend(told.reach)),
+            np.hypot(m.flow_noise, bend(told.flow)),
+            np.hypot(m.moment_noise, second),
+            self.noise.background,
         )
 
     def _slack(self, keep: np.ndarray | None) -> Slack | None:
@@ -232,35 +169,33 @@ class ClipFit:
         """Which residuals belong to kept frames."""
         m = self.measured
         both = keep[:-1] & keep[1:]
-        parts = [(keep, m.reach), (both, m.flow), (both, m.background)]
+        parts = [(keep, m.reach), (both, m.flow), (keep, m.moments), (both, m.background)]
         return np.concatenate([np.repeat(held, array[0].size) for held, array in parts])
 
     # --- residuals ------------------------------------------------------------------------------------------------
-    def distances(self, prediction: Prediction) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Predicted minus measured [px]: reach, flow, background; NaN where nothing was measured."""
-        m = self.measured
-        # An object that nothing shows any more, where a mask is, misses it by its whole size.
-        reach = np.where(np.isnan(prediction.reach) & np.isfinite(m.reach), 30.0, prediction.reach - m.reach)
-        return reach, prediction.flow - m.flow, prediction.background - m.background
+    def distances(self, prediction: Prediction) -> Parts:
+        """Predicted minus measured [px]; NaN where nothing was measured."""
+        parts = [told - seen for told, seen in zip(prediction.parts, self.measured.parts, strict=True)]
+        for k in (0, 2):
+            # An object that nothing shows any more, where a mask is, misses it by its whole size.
+            lost = np.isnan(prediction.parts[k]) & np.isfinite(self.measured.parts[k])
+            parts[k] = np.where(lost, 30.0, parts[k])
+        return Parts(*parts)
 
     def whitened(
         self,
-        distances: tuple[np.ndarray, np.ndarray, np.ndarray],
+        distances: Parts,
         keep: Bool[np.ndarray, "frames"] | None,
         scale: float,
     ) -> Float[np.ndarray, "batch residuals"]:
         """Robust residuals in noise widths; zero where nothing was measured, and in frames that are not kept."""
-        reach, flow, background = distances
-        noise = self.noise
-        parts = []
-        for raw, sigma, count in (
-            (reach, noise.edge[:, :, None], self.edge_count / reach.shape[-1]),
-            (flow, noise.flow[:, :, None, None], self.flow_count / flow.shape[-2]),
-            (background, noise.background, BACKGROUND_COUNT / max(background.shape[-2], 1)),
-        ):
-            part = slowed(np.nan_to_num(raw) / sigma, scale) * np.sqrt(count)
-            parts.append(part.reshape(len(part), -1))
-        white = np.concatenate(parts, 1)
+        noise, counts = self.noise, self.counts.of(distances)
+        widths = (noise.edge[:, :, None], noise.flow[:, :, None, None], noise.moments, np.array(noise.background))
+        parts = [
+            slowed(np.nan_to_num(raw) / sigma, scale * patience) * np.sqrt(count)
+            for raw, sigma, count, patience in zip(distances, widths, counts, PATIENCE, strict=True)
+        ]
+        white = Parts(*parts).flat()
         if keep is not None:
             white = white * self._kept(keep)
         slack = self._slack(keep)
@@ -268,16 +203,14 @@ class ClipFit:
 
     def expected(self, beside: bool = True) -> float:
         """Sum of squares that noise alone would give, with the background's or without."""
-        m = self.measured
-        total = self.edge_count / m.reach.shape[-1] * float(np.isfinite(m.reach).sum())
-        total += self.flow_count / m.flow.shape[-2] * float(np.isfinite(m.flow).sum())
-        if beside:
-            total += BACKGROUND_COUNT / max(m.background.shape[-2], 1) * float(np.isfinite(m.background).sum())
-        return max(total, 1.0)
+        parts = self.measured.parts
+        seen = [float(np.isfinite(part).sum()) for part in parts]
+        each = [count * number for count, number in zip(self.counts.of(parts), seen, strict=True)]
+        return max(sum(each if beside else each[:-1]), 1.0)
 
     def misfit(self, fit: Fit) -> float:
         """Mean square residual of the objects in noise widths."""
-        objects = self.measured.reach.size + self.measured.flow.size
+        objects = len(fit.residual) - self.measured.background.size
         return float((fit.residual[:objects] ** 2).sum()) / self.expected(beside=False)
 
     def rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
@@ -297,10 +230,11 @@ class ClipFit:
         cost = 0.5 * (white**2).sum(1) + 0.5 * (prior(hypothesis, z)[0] ** 2).sum(1)
         return white, np.where(prediction.bad, np.inf, cost)
 
-    def jacobian(self, hypothesis: Hypothesis, z: np.ndarray, base: np.ndarray, keep=None, scale: float = SCALE):
+    def jacobian(
+        self, hypothesis: Hypothesis, z: np.ndarray, base: np.ndarray, keep=None, scale: float = SCALE, size=STEPS[0]
+    ):
         """d residuals / d z (R, D) by differences towards the inside of the bounds."""
         low, high = hypothesis.bounds
-        size = np.where(hypothesis.ordinary, STEP, EFFECT_STEP)
         step = np.where(z + size > high, -size, size)
         points = np.clip(z + np.diag(step), low, high)
         moves = hypothesis.moves
@@ -319,7 +253,8 @@ class ClipFit:
         z = np.clip(z, low, high)
         base, costs = self.residuals(hypothesis, z[None], keep, scale)
         base, cost = base[0], float(costs[0])
-        jacobian = self.jacobian(hypothesis, z, base, keep, scale)
+        size, failed = STEPS[0], 0
+        jacobian = self.jacobian(hypothesis, z, base, keep, scale, size)
         damping = 1.0
         for _ in range(iterations):
             price, slope = prior(hypothesis, z)
@@ -328,17 +263,24 @@ class ClipFit:
             trials = np.array([self._step(z, gradient, curvature, f, low, high) for f in DAMPINGS * damping])
             moved, costs = self.residuals(hypothesis, trials, keep, scale)
             best = int(np.argmin(costs))
-            if not costs[best] < cost:
-                if damping > 1e3:
-                    break
-                damping *= 300.0
-                continue
             gain = cost - float(costs[best])
-            z, base, cost = trials[best], moved[best], float(costs[best])
-            damping = float(np.clip(damping * DAMPINGS[best], 1e-3, 1e3))
+            if gain > 0:
+                z, base, cost = trials[best], moved[best], float(costs[best])
+                damping = float(np.clip(damping * DAMPINGS[best], 1e-3, 1e3))
+            if gain < 0.05 + 1e-4 * cost:
+                failed += 1
+                if failed > len(STEPS):
+                    break
+                # First shorter steps, then other derivatives.
+                shorter = failed == 1 and gain <= 0
+                damping = min(300.0 * damping, 1e3) if shorter else 1.0
+                size = size if shorter else STEPS[(STEPS.index(size) + 1) % len(STEPS)]
+            else:
+                failed = 0
+            if gain > 0 or failed:
+                jacobian = self.jacobian(hypothesis, z, base, keep, scale, size)
+        if size != STEPS[0]:
             jacobian = self.jacobian(hypothesis, z, base, keep, scale)
-            if gain < 0.05 + 2e-4 * cost:
-                break
         return self._finished(hypothesis, z, base, jacobian)
 
     def best_of(self, hypothesis: Hypothesis, points: Float[np.ndarray, "points dimension"], keep=None) -> np.ndarray:

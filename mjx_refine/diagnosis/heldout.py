@@ -81,21 +81,16 @@ def _outside(clip: ClipFit, fit: Fit, keep: np.ndarray) -> np.ndarray:
 
 def _by_frame(clip: ClipFit, white: np.ndarray) -> np.ndarray:
     """Sum of squares of each frame's residuals over what noise alone gives."""
-    m = clip.measured
-    a, b = m.reach.size, m.reach.size + m.flow.size
-    total = (white[:a].reshape(m.reach.shape) ** 2).sum((1, 2))
-    total[:-1] += (white[a:b].reshape(m.flow.shape) ** 2).sum((1, 2, 3))
-    total[:-1] += (white[b:].reshape(m.background.shape) ** 2).sum((1, 2))
+    parts = clip.measured.split(white)
+    total = (parts.reach**2).sum((1, 2)) + (parts.moments**2).sum((1, 2))
+    total[:-1] += (parts.flow**2).sum((1, 2, 3)) + (parts.background**2).sum((1, 2))
     return total / max(clip.expected() / clip.frames, 1e-9)
 
 
 def _rough(clip: ClipFit, fit: Fit) -> np.ndarray:
     """What of a fit's residuals changes from frame to frame, as noise does: by frame, in the same units."""
-    m, white = clip.measured, fit.residual
-    a, b = m.reach.size, m.reach.size + m.flow.size
     parts = []
-    for part, shape in ((white[:a], m.reach.shape), (white[a:b], m.flow.shape), (white[b:], m.background.shape)):
-        series = part.reshape(shape)
+    for series in clip.measured.split(fit.residual):
         step = np.diff(series, axis=0) / np.sqrt(2.0)
-        parts.append(np.concatenate([step[:1], step]).ravel() if len(step) else part)
+        parts.append(np.concatenate([step[:1], step]).ravel() if len(step) else series.ravel())
     return _by_frame(clip, np.concatenate(parts))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,6 +11,7 @@ from scipy import ndimage
 
 from mjx_refine.observation import Observation
 from mjx_refine.search.features import flow_points, outlines
+from mjx_refine.view.moments import whole_masks
 from mjx_refine.view.tiles import foreground
 
 GRID = (6, 4)
@@ -18,8 +20,32 @@ GRID = (6, 4)
 EDGE_FLOOR, FLOW_FLOOR = 0.3, 0.15
 """Noise that is assumed at least [px]: masks are drawn in whole pixels, and no flow is better."""
 
+MOMENT_FLOOR = 0.05
+"""Noise of centroids and of the radius that a mask's area is worth, that is assumed at least [px]: pixels average over an
+outline, whole ones as they are."""
+
 FLOW_PART = 0.08
 """Error of measured flow that is smooth over an object, as a part of its motion; half where its noise is stated."""
+
+
+class Parts(NamedTuple):
+    """One array for each kind of measurement, measured, predicted, or the difference.
+
+    Attributes:
+      reach: how far each object's mask reaches, (..., frames, objects, directions).
+      flow: on the objects, (..., intervals, objects, points, 2).
+      moments: centroid and equivalent radius of whole masks, (..., frames, objects, 3).
+      background: flow beside the objects, (..., intervals, places, 2).
+    """
+
+    reach: Any
+    flow: Any
+    moments: Any
+    background: Any
+
+    def flat(self) -> np.ndarray:
+        """All in one row for each entry of the leading axis."""
+        return np.concatenate([part.reshape(len(part), -1) for part in self], 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +54,7 @@ class Measured:
 
     Attributes:
       reach: how far each object's mask reaches [px]; NaN where that is not known.
+      moments: of each mask that is seen whole: its centroid and the radius of a disc as large [px]; NaN elsewhere.
       pixels: points of each mask.
       flow: the flow there [px/frame]; NaN where it was not measured.
       places: points of a grid over the picture [px].
@@ -35,11 +62,13 @@ class Measured:
       present: whether the object has a mask.
       edge_noise: of ``reach``, by object [px].
       flow_noise: of ``flow``, by object [px].
+      moment_noise: of ``moments``, by object [px].
       background_noise: of ``background`` [px].
       stated: whether the clip says how noisy its flow is.
     """
 
     reach: Float[np.ndarray, "frames objects directions"]
+    moments: Float[np.ndarray, "frames objects 3"]
     pixels: Float[np.ndarray, "frames objects points 2"]
     flow: Float[np.ndarray, "intervals objects points 2"]
     places: Float[np.ndarray, "places 2"]
@@ -47,8 +76,20 @@ class Measured:
     present: np.ndarray
     edge_noise: Float[np.ndarray, "objects"]
     flow_noise: Float[np.ndarray, "objects"]
+    moment_noise: Float[np.ndarray, "objects 3"]
     background_noise: float
     stated: bool
+
+    @property
+    def parts(self) -> Parts:
+        """All that predictions are compared with."""
+        return Parts(self.reach, self.flow, self.moments, self.background)
+
+    def split(self, row: Float[np.ndarray, "residuals"]) -> Parts:
+        """A row of ``Parts.flat`` in its parts again."""
+        ends = np.cumsum([part.size for part in self.parts])[:-1]
+        pieces = np.split(row, ends)
+        return Parts(*(piece.reshape(part.shape) for piece, part in zip(pieces, self.parts, strict=True)))
 
 
 def measure(observation: Observation, columns: tuple[int, ...]) -> Measured:
@@ -64,12 +105,14 @@ def measure(observation: Observation, columns: tuple[int, ...]) -> Measured:
     chosen, lost = [max(j, 0) for j in columns], np.array([j < 0 for j in columns])
     reach = np.where(lost[None, :, None], np.nan, seen.support[:, chosen])
     flow = np.where(lost[None, :, None, None], np.nan, flow[:-1, chosen])
+    moments = np.where(lost[None, :, None], np.nan, whole_masks(masks, seen.ids)[:, chosen])
     places, background = _beside(masks, observation.flow)
     sigma = observation.flow_sigma
     given = float(np.nanmedian(sigma)) if sigma is not None else 0.0
     present = np.isfinite(seen.centre[:, chosen, 0]) & ~lost
     return Measured(
         reach=reach,
+        moments=moments,
         pixels=pixels[:, chosen],
         flow=flow,
         places=places,
@@ -77,15 +120,16 @@ def measure(observation: Observation, columns: tuple[int, ...]) -> Measured:
         present=present,
         edge_noise=np.maximum(_roughness(reach), EDGE_FLOOR),
         flow_noise=_flow_noise(pixels[:-1, chosen], flow, given),
+        moment_noise=np.stack([np.maximum(_roughness(moments[..., k : k + 1]), MOMENT_FLOOR) for k in range(3)], -1),
         background_noise=max(1.5 * _spread(background), given / 3, 0.05),
         stated=sigma is not None,
     )
 
 
 def _roughness(reach: Float[np.ndarray, "frames objects directions"]) -> Float[np.ndarray, "objects"]:
-    """Noise of the outlines from third differences in time, which no steady acceleration changes [px]."""
+    """Noise of outlines and moments from third differences in time, which no steady acceleration changes [px]."""
     if len(reach) < 6:
-        return np.full(reach.shape[1], EDGE_FLOOR)
+        return np.zeros(reach.shape[1])
     third = np.abs(np.diff(reach, 3, axis=0)) / np.sqrt(20.0)
     return np.array([1.4826 * _median(third[:, n]) for n in range(reach.shape[1])])
 

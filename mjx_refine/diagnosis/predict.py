@@ -1,4 +1,4 @@
-"""What a batch of scenes predicts of a clip's measurements: reach of the masks, flow on the objects and beside them."""
+"""What scenes predict of a clip's measurements: reach and moments of masks, flow on the objects and beside them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.batch import SceneBatch
+from mjx_refine.diagnosis.measure import Parts
 from mjx_refine.effects import acting
 from mjx_refine.effects.kind import OutlineView
 from mjx_refine.scene import Shape
 from mjx_refine.search.features import DIRECTIONS
+from mjx_refine.view.moments import whole_function
 from mjx_refine.view.outline import Arrays, directions, place, support_of
 from mjx_refine.view.points import point_flow_function
-from mjx_refine.view.seen import outline_function
+from mjx_refine.view.seen import changed_moments, outline_function
 
 SIZES = (8, 128)
 """Batch sizes that are compiled."""
@@ -30,14 +32,21 @@ class Prediction:
     Attributes:
       reach: support functions of the silhouettes [px]; NaN where nothing is seen.
       flow: at the measured points of the objects [px/frame].
+      moments: centroids and equivalent radii of the silhouettes [px].
       background: flow at the measured points beside the objects [px/frame].
       bad: candidates that diverged.
     """
 
     reach: Float[np.ndarray, "batch frames objects directions"]
     flow: Float[np.ndarray, "batch intervals objects points 2"]
+    moments: Float[np.ndarray, "batch frames objects 3"]
     background: Float[np.ndarray, "batch intervals places 2"]
     bad: np.ndarray
+
+    @property
+    def parts(self) -> Parts:
+        """All that measurements are compared with."""
+        return Parts(self.reach, self.flow, self.moments, self.background)
 
 
 def _plain_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]):
@@ -50,7 +59,7 @@ def _plain_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int,
 @functools.partial(jax.jit, static_argnums=(0, 3, 4))
 def _predict(shapes, arrays, pixels, image, drawn: bool):
     told = outline_function(shapes, arrays, image, DIRECTIONS) if drawn else (_plain_function(shapes, arrays, image),)
-    return told, point_flow_function(shapes, arrays, pixels, image)
+    return told, whole_function(shapes, arrays, image), point_flow_function(shapes, arrays, pixels, image)
 
 
 class Predictor:
@@ -85,8 +94,9 @@ class Predictor:
         device = tuple(
             jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32) for a in arrays
         )
-        told, flow = _predict(self.shapes, device, jnp.asarray(self.pixels, jnp.float32), self.image, drawn)
+        told, whole, flow = _predict(self.shapes, device, jnp.asarray(self.pixels, jnp.float32), self.image, drawn)
         told = [np.asarray(a, np.float64)[: len(poses)] for a in told]
+        whole = np.asarray(whole, np.float64)[: len(poses)]
         flow = np.asarray(flow, np.float64)[: len(poses), :-1]
         reach = told[0]
         if drawn:
@@ -95,9 +105,11 @@ class Predictor:
             view = OutlineView(
                 reach, told[1], rate, directions(DIRECTIONS), told[2], told[3], focal, self.image, self.fps
             )
-            reach = reach + acting.outline_change(batch, view)
+            change = acting.outline_change(batch, view)
+            reach = reach + change
+            whole = changed_moments(whole, batch, view, change)
             flow = self._seen_flow(flow, batch, focal)
-        return Prediction(reach, flow, self._background(batch, len(poses), poses.shape[1]), bad)
+        return Prediction(reach, flow, whole, self._background(batch, len(poses), poses.shape[1]), bad)
 
     def _seen_flow(self, flow: np.ndarray, batch: SceneBatch, focal: np.ndarray) -> np.ndarray:
         here = np.broadcast_to(self.pixels[None, :-1], flow.shape)

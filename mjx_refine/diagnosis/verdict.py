@@ -67,18 +67,30 @@ def best_candidate(compared: Compared) -> Candidate | None:
 
 
 def structure(clip: ClipFit, fit) -> float:
-    """Energy of the residuals' running means over five frames, against what white noise of the same differences has."""
-    reach = fit.residual[: clip.measured.reach.size].reshape(clip.measured.reach.shape)
-    seen = np.isfinite(clip.measured.reach)
+    """Energy of the residuals' running means over five frames, against what white noise of the same differences has.
+
+    Centroids where a mask is seen whole, else how far it reaches: that errs smoothly by itself, as pixels pass by.
+    """
+    parts = clip.measured.split(fit.residual)
     ratios = []
-    for n in range(reach.shape[1]):
-        series = np.where(seen[:, n], reach[:, n], np.nan)
-        if len(series) < 7:
-            continue
-        means = np.mean([series[k : len(series) - 4 + k] for k in range(5)], 0)
-        rough = np.nanmean(np.diff(series, axis=0) ** 2) / 2
-        ratios.append(5 * np.nanmean(means**2) / max(float(rough), 1e-6))
-    return float(np.nan_to_num(np.mean(ratios), nan=1.0)) if ratios else 1.0
+    for n in range(parts.reach.shape[1]):
+        ratio = _persistence(parts.moments[:, n], np.isfinite(clip.measured.moments[:, n]))
+        if not np.isfinite(ratio):
+            ratio = _persistence(parts.reach[:, n], np.isfinite(clip.measured.reach[:, n]))
+        ratios.append(ratio)
+    return float(np.nan_to_num(np.nanmean(ratios), nan=1.0)) if np.isfinite(ratios).any() else 1.0
+
+
+def _persistence(residual: np.ndarray, seen: np.ndarray) -> float:
+    """What ``structure`` says of one object; NaN where too little of it is seen."""
+    series = np.where(seen, residual, np.nan)
+    if len(series) < 7:
+        return np.nan
+    means = np.mean([series[k : len(series) - 4 + k] for k in range(5)], 0)
+    steps = np.diff(series, axis=0)
+    if np.isfinite(means).sum() < 6:
+        return np.nan
+    return float(5 * np.nanmean(means**2) / max(float(np.nanmean(steps**2)) / 2, 1e-6))
 
 
 LITTLE = 15.0

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from mjx_refine.diagnosis.fit import BACKGROUND_COUNT, ClipFit, Fit
+from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.noise import BACKGROUND_COUNT
 from mjx_refine.diagnosis.result import CHANNELS, Place
 from mjx_refine.effects.kind import FitView
 from mjx_refine.search.features import DIRECTIONS
@@ -19,27 +20,17 @@ def misfit_map(
     clip: ClipFit, fit: Fit
 ) -> tuple[Float[np.ndarray, "objects frames"], Int[np.ndarray, "objects frames"], Float[np.ndarray, "frames"]]:
     """(mean square misfit by object and frame, its channel, the background's mean square misfit)."""
-    m = clip.measured
-    white = _parts(clip, fit)
-    reach, flow, background = white
-    seen = np.isfinite(m.reach).mean(-1) > 0
-    edges = (reach**2).sum(-1) / clip.edge_count
-    moved = np.zeros_like(edges)
-    moved[:-1] = (flow**2).sum((-1, -2)) / (2 * clip.flow_count)
-    total = np.where(seen, 0.6 * edges + 0.4 * moved, 0.0)
-    beside = np.zeros(len(reach))
-    beside[:-1] = (background**2).sum((-1, -2)) / (2 * BACKGROUND_COUNT)
-    return total.T, _channels(reach, moved).T, beside
-
-
-def _parts(clip: ClipFit, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    m, residual = clip.measured, fit.residual
-    a, b = m.reach.size, m.reach.size + m.flow.size
-    return (
-        residual[:a].reshape(m.reach.shape),
-        residual[a:b].reshape(m.flow.shape),
-        residual[b:].reshape(m.background.shape),
-    )
+    parts = clip.measured.split(fit.residual)
+    seen = np.isfinite(clip.measured.reach).mean(-1) > 0
+    whole = np.isfinite(clip.measured.moments).all(-1)
+    still = (parts.reach**2).sum(-1) + (parts.moments**2).sum(-1)
+    still = still / (clip.counts.edge + 3.0 * whole)
+    moved = np.zeros_like(still)
+    moved[:-1] = (parts.flow**2).sum((-1, -2)) / (2 * clip.counts.flow)
+    total = np.where(seen, 0.6 * still + 0.4 * moved, 0.0)
+    beside = np.zeros(len(still))
+    beside[:-1] = (parts.background**2).sum((-1, -2)) / (2 * BACKGROUND_COUNT)
+    return total.T, _channels(parts.reach, moved).T, beside
 
 
 def _channels(reach: np.ndarray, moved: np.ndarray) -> np.ndarray:

@@ -104,6 +104,13 @@ def loads(batch: SceneBatch, motion: Motion) -> Loads | None:
     return sum(force for force, _ in found), sum(torque for _, torque in found)  # type: ignore[return-value]
 
 
+def idle(batch: SceneBatch, motion: Motion) -> float:
+    """For how long the loads and the floor's friction surely stay as they are [s]."""
+    named = with_loads(batch)
+    told = [k.idle(motion, e.target, e.values) for k, e in _acting(batch) if k.name in named]
+    return float(np.min(told, initial=np.inf))
+
+
 def floor_friction(batch: SceneBatch, motion: Motion) -> Float[np.ndarray, "batch objects"] | None:
     """Sliding friction with the floor where an effect changes it (NaN elsewhere), or None."""
     found = [kind.floor_friction(motion, effect.target, effect.values) for kind, effect in _acting(batch)]
@@ -236,6 +243,17 @@ def outline_change(batch: SceneBatch, view: OutlineView) -> Float[np.ndarray, "b
         if told is not None:
             total = total + told
     return total
+
+
+def hidden_polygons(
+    batch: SceneBatch, outline: Float[np.ndarray, "batch frames objects corners 2"]
+) -> Float[np.ndarray, "batch frames objects others 2"] | None:
+    """The parts of convex polygons that an effect hides [px], or None where none does."""
+    for kind, effect in _acting(batch):
+        told = kind.hidden(outline, effect.values)
+        if told is not None:
+            return told
+    return None
 
 
 def warped(

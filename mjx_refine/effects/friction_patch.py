@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Motion, Start
+from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Motion, Start, fastest
 
 
 class FrictionPatch(EffectKind):
@@ -26,6 +26,10 @@ class FrictionPatch(EffectKind):
     def floor_friction(self, motion: Motion, target: int, values: np.ndarray) -> np.ndarray | None:
         away = np.linalg.norm(motion.position[..., :2] - values[:, None, :2], axis=-1)
         return np.where(away < values[:, 2:3], values[:, 3:4], np.nan)
+
+    def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
+        away = np.linalg.norm(motion.position[..., :2] - values[:, None, :2], axis=-1)
+        return float(np.abs(away - values[:, 2:3]).min()) / fastest(motion)
 
     def starts(self, view: FitView, target: int) -> list[Start]:
         found = []

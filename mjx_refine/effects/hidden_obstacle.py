@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
-from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Loads, Motion, Start, of_target
+from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Loads, Motion, Start, fastest, of_target
 
 STIFFNESS = 20000.0
 """Of the wall's contact at most [1/s^2]."""
@@ -35,10 +35,7 @@ class HiddenObstacle(EffectKind):
     )
 
     def loads(self, motion: Motion, target: int, values: np.ndarray) -> Loads | None:
-        angle = np.deg2rad(values[:, 0])
-        normal = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1)
-        arm = foremost(motion, target, -normal)
-        depth = values[:, 1] - ((motion.position[:, target] + arm) * normal).sum(-1)
+        normal, arm, depth = _met(motion, target, values)
         if not (depth > 0).any():
             return None
         velocity = motion.velocity[:, target] + np.cross(motion.spin[:, target], arm)
@@ -53,6 +50,10 @@ class HiddenObstacle(EffectKind):
         )
         force = size[:, None] * (normal - grip)
         return of_target(motion.batch, target, force), of_target(motion.batch, target, np.cross(arm, force))
+
+    def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
+        gap = -_met(motion, target, values)[2]
+        return float(np.where(gap > 0, gap, 0.0).min()) / fastest(motion)
 
     def starts(self, view: FitView, target: int) -> list[Start]:
         found = []
@@ -83,6 +84,14 @@ class HiddenObstacle(EffectKind):
         reach = float((foremost(still, 0, -normal) * normal).sum())
         distance = float(normal[0, :2] @ pose[0, 0, :2]) + reach
         return Start(np.array([angle, distance, 0.5]), width=np.array([25.0, 0.08, 0.3]))
+
+
+def _met(motion: Motion, target: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The wall's normals, the way from the target's centre to its foremost point, and how deep that is in the wall [m]."""
+    angle = np.deg2rad(values[:, 0])
+    normal = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1)
+    arm = foremost(motion, target, -normal)
+    return normal, arm, values[:, 1] - ((motion.position[:, target] + arm) * normal).sum(-1)
 
 
 def stiffness_of(step: float) -> float:

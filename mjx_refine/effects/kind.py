@@ -186,6 +186,10 @@ class EffectKind:
         """Sliding friction of every object with the floor, (batch, objects); NaN where it stays as it is."""
         return None
 
+    def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
+        """For how long loads and floor friction stay as they are at this instant, surely [s]; 0: nobody knows."""
+        return 0.0
+
     def centre_of_mass(self, batch: SceneBatch, target: int, values: np.ndarray) -> np.ndarray | None:
         """Centres of mass in the bodies' frames [m], (batch, objects, 3)."""
         return None
@@ -205,6 +209,10 @@ class EffectKind:
 
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         """What is added to the support functions [px], broadcast to (batch, frames, objects, directions)."""
+        return None
+
+    def hidden(self, outline: np.ndarray, values: np.ndarray) -> np.ndarray | None:
+        """The part of convex polygons (batch, frames, objects, corners, 2) [px] that is not seen, as polygons, or None."""
         return None
 
     def warp(self, points: np.ndarray, focal: np.ndarray, image: tuple[int, int], values: np.ndarray):
@@ -309,3 +317,10 @@ def of_target(batch: SceneBatch, target: int, vector: np.ndarray) -> np.ndarray:
     result = np.zeros((*batch.mass.shape, 3))
     result[:, target] = vector
     return result
+
+
+def fastest(motion: Motion) -> float:
+    """A speed that no point of a body will exceed while it is looked away from [m/s]."""
+    speed = np.linalg.norm(motion.velocity, axis=-1)
+    rim = np.linalg.norm(motion.spin, axis=-1) * np.linalg.norm(motion.batch.size, axis=-1)
+    return float(np.nan_to_num((speed + rim).max(), nan=0.0)) + 2.0

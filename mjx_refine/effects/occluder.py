@@ -23,6 +23,19 @@ def _beyond(contact: np.ndarray, normals: np.ndarray, axis: int, sign: float, si
     return most
 
 
+def _between(polygon: np.ndarray, axis: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Polygons cut to low < x[axis] < high: points are added where edges cross, and what lies outside is laid on the border,
+    where it encloses nothing."""
+    following = np.roll(polygon, -1, axis=-2)
+    along = following - polygon
+    length = np.where(np.abs(along[..., axis]) < 1e-9, 1e-9, along[..., axis])
+    crossings = [np.clip((side - polygon[..., axis]) / length, 0.0, 1.0) for side in (low, high)]
+    parts = np.stack([np.zeros_like(crossings[0]), np.minimum(*crossings), np.maximum(*crossings)], -1)
+    points = polygon[..., None, :] + parts[..., None] * along[..., None, :]
+    points[..., axis] = np.clip(points[..., axis], low[..., None], high[..., None])
+    return points.reshape(*polygon.shape[:-2], -1, 2)
+
+
 class Occluder(EffectKind):
     """Inside an upright rectangle of the picture nothing of the objects is seen."""
 
@@ -42,6 +55,10 @@ class Occluder(EffectKind):
         for axis, sign, side in ((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom)):
             most = np.maximum(most, _beyond(view.contact, view.normals, axis, sign, side))
         return np.where(np.isfinite(most), np.minimum(most - view.reach, 0.0), np.nan)
+
+    def hidden(self, outline: np.ndarray, values: np.ndarray) -> np.ndarray | None:
+        left, top, right, bottom = (values[:, k, None, None, None] for k in range(4))
+        return _between(_between(outline, 0, left, right), 1, top, bottom)
 
     def starts(self, view: FitView, target: int) -> list[Start]:
         return [Start(np.array(r), width=np.full(4, 6.0), places=20 * len(view.hidden)) for r in view.hidden]

@@ -38,6 +38,10 @@ class Push(EffectKind):
         force = of_target(motion.batch, target, values[:, 1:4] * share[:, None])
         return force, np.zeros_like(force)
 
+    def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
+        until = values[:, 0] - motion.time
+        return float(np.where(until > 0, until, np.where(until > -DURATION, 0.0, np.inf)).min())
+
     def starts(self, view: FitView, target: int) -> list[Start]:
         onsets = np.arange(0.5, view.frames - 1.5, 1.0) / view.fps
         mass = view.mass(target)

@@ -25,7 +25,8 @@ def stepped_rollout(
 ) -> Float[np.ndarray, "batch intervals positions"]:
     """``qpos`` at the start of frames 1, 2, ... under the loads of the batch's effects.
 
-    The loads of a step are those of the state at its start (explicit, as MuJoCo's Euler integrator has all forces).
+    The loads of a step are those of the state at its start (explicit, as MuJoCo's Euler integrator has all forces); while
+    every effect says that its loads stay as they are, steps are taken together.
 
     Args:
       pool: threads.
@@ -43,8 +44,11 @@ def stepped_rollout(
     current, warm = usual.copy(), np.zeros((count, models[0].nv))
     result = np.empty((count, frames - 1, positions))
     spec = mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
-    for k in range((frames - 1) * SUBSTEPS):
+    k, last = 0, (frames - 1) * SUBSTEPS
+    while k < last:
         motion = _motion(state, batch, k * step, step, world)
+        idle = np.nan_to_num(acting.idle(batch, motion), posinf=1e3)
+        steps = int(np.clip(idle // step, 1, last - k))
         told = _about_the_mass(acting.loads(batch, motion), motion, acting.centre_of_mass(batch))
         applied[:] = 0.0
         if told is not None:
@@ -61,15 +65,16 @@ def stepped_rollout(
             models,
             data,
             state,
-            applied.reshape(count, 1, -1),
+            np.repeat(applied.reshape(count, 1, -1), steps, 1),
             control_spec=spec,
-            nstep=1,
+            nstep=steps,
             initial_warmstart=warm,
             skip_checks=False,
         )
-        state = np.array(states)[:, 0]
-        if (k + 1) % SUBSTEPS == 0:
-            result[:, (k + 1) // SUBSTEPS - 1] = state[:, 1 : 1 + positions]
+        states = np.asarray(states)
+        ends = np.arange(-(-(k + 1) // SUBSTEPS) * SUBSTEPS, k + steps + 1, SUBSTEPS)
+        result[:, ends // SUBSTEPS - 1] = states[:, ends - k - 1, 1 : 1 + positions]
+        state, k = states[:, -1].copy(), k + steps
     for row, model in enumerate(models):
         model.pair_friction[:objects, :2] = usual[row, :, None]
     return result

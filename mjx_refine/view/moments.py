@@ -197,3 +197,20 @@ def mask_moments(masks: Int[np.ndarray, "frames height width"], ids: tuple[int, 
             area[t, j], centroid[t, j] = len(points), points.mean(0)
             second[t, j] = np.cov(points.T, bias=True)
     return Moments(area, centroid, second)  # type: ignore[arg-type]
+
+
+def whole_masks(
+    masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...]
+) -> Float[np.ndarray, "frames ids 3"]:
+    """Centroid and equivalent radius, that of a disc as large, of masks that are seen whole [px]; NaN elsewhere."""
+    found = mask_moments(masks, ids)
+    return np.concatenate([found.centroid, np.sqrt(found.area / np.pi)[..., None]], -1)
+
+
+def whole_function(
+    shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]
+) -> Float[Array, "batch frames objects 3"]:
+    """Centroid and equivalent radius of each object's silhouette as if nothing hid it [px]; pure."""
+    found = moments(shapes, arrays, image)
+    radius = jnp.sqrt(jnp.maximum(found.area, 0.0) / jnp.pi)
+    return jnp.concatenate([found.centroid, radius[..., None]], -1)

@@ -13,6 +13,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting
 from mjx_refine.effects.kind import OutlineView
 from mjx_refine.scene import Shape
+from mjx_refine.view.moments import whole_function
 from mjx_refine.view.outline import BATCHES, Arrays, directions, larger, place, support_of, supports
 from mjx_refine.view.points import point_flow
 
@@ -40,6 +41,47 @@ def outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int
 
 
 _outline = jax.jit(outline_function, static_argnums=(0, 2, 3))
+_whole = jax.jit(whole_function, static_argnums=(0, 2))
+
+
+def _padded(poses: np.ndarray, batch: SceneBatch) -> Arrays:
+    """Poses, sizes and cameras on the device, with rows added up to a size that is compiled."""
+    arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
+    size = next((b for b in BATCHES if b >= len(poses)), -(-len(poses) // BATCHES[-1]) * BATCHES[-1])
+    return tuple(jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32) for a in arrays)
+
+
+def changed_moments(
+    moments: Float[np.ndarray, "batch frames objects 3"],
+    batch: SceneBatch,
+    view: OutlineView,
+    change: Float[np.ndarray, "batch frames objects directions"],
+) -> Float[np.ndarray, "batch frames objects 3"]:
+    """Centroids and equivalent radii [px] of silhouettes that effects change by ``change``, or hide in part.
+
+    To first order in the change: the polygon of contact points is moved along its normals, and its own moments' change is
+    added to the exact ones.
+    """
+    before = polygon_sums(view.contact)
+    hidden = acting.hidden_polygons(batch, view.contact)
+    if hidden is None:
+        after = polygon_sums(view.contact + change[..., None] * view.normals)
+    else:
+        after = before - polygon_sums(hidden)
+    area = [np.maximum(np.abs(sums[..., 0]), 1e-9) for sums in (before, after)]
+    shift = after[..., 1:] / area[1][..., None] - before[..., 1:] / area[0][..., None]
+    ratio = np.sqrt(np.abs(after[..., 0]) / area[0])
+    seen = np.isfinite(change).any(-1) & (ratio > 0.05)
+    result = np.concatenate([moments[..., :2] + shift, (moments[..., 2] * ratio)[..., None]], -1)
+    return np.where(seen[..., None], result, np.nan)
+
+
+def polygon_sums(points: Float[np.ndarray, "*grid corners 2"]) -> Float[np.ndarray, "*grid 3"]:
+    """Integrals of 1, x and y over polygons, positive for those that turn from x towards y (Green's theorem)."""
+    following = np.roll(points, -1, axis=-2)
+    cross = points[..., 0] * following[..., 1] - points[..., 1] * following[..., 0]
+    first = ((points + following) * cross[..., None]).sum(-2) / 6
+    return np.concatenate([cross.sum(-1, keepdims=True) / 2, first], -1)
 
 
 def focal_length(batch: SceneBatch, image: tuple[int, int]) -> Float[np.ndarray, "batch"]:
@@ -55,10 +97,7 @@ def outline_view(
     fps: float,
 ) -> OutlineView:
     """The silhouettes of ``poses``, which are ``apparent`` ones, in ``count`` directions."""
-    arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
-    size = next((b for b in BATCHES if b >= len(poses)), -(-len(poses) // BATCHES[-1]) * BATCHES[-1])
-    device = tuple(jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32) for a in arrays)
-    told = _outline(batch.shapes, device, image, count)
+    told = _outline(batch.shapes, _padded(poses, batch), image, count)
     reach, contact, facing, scale = (np.asarray(a, np.float64)[: len(poses)] for a in told)
     rate = np.gradient(reach, axis=1) if reach.shape[1] > 1 else np.zeros_like(reach)
     return OutlineView(reach, contact, rate, directions(count), facing, scale, focal_length(batch, image), image, fps)
@@ -77,6 +116,18 @@ def seen_supports(
         return supports(seen, batch, image, count)
     view = outline_view(seen, batch, image, count, fps)
     return view.reach + acting.outline_change(batch, view)
+
+
+def seen_moments(
+    poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch, image: tuple[int, int], fps: float
+) -> Float[np.ndarray, "batch frames objects 3"]:
+    """Centroids and equivalent radii of silhouettes with the effects of ``batch`` [px]; NaN where they hide nearly all."""
+    seen = acting.apparent(poses, batch, fps)
+    told = np.asarray(_whole(batch.shapes, _padded(seen, batch), image), np.float64)[: len(poses)]
+    if not acting.changes_outlines(batch):
+        return told
+    view = outline_view(seen, batch, image, 16, fps)
+    return changed_moments(told, batch, view, acting.outline_change(batch, view))
 
 
 def seen_point_flow(
