@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import sys
 from collections.abc import Iterator, Sequence
@@ -14,6 +13,7 @@ import click
 from mjx_refine.cli.describe import describe
 from mjx_refine.cli.diagnose import diagnose
 from mjx_refine.cli.edit import edit
+from mjx_refine.cli.evaluate import evaluate
 from mjx_refine.cli.many import ENGINES, refine_many_command
 from mjx_refine.cli.types import FiniteFloat, Size
 from mjx_refine.errors import InputError
@@ -213,27 +213,7 @@ def export(scene: Path, out: Path, fps: float) -> None:
     click.echo(f"{out}: play it with `python -m mujoco.viewer --mjcf={out}` (load key 0 for the velocities)")
 
 
-@app.command()
-@click.option("--scene", type=_PATH, required=True, help="The scene to judge.")
-@click.option("--video", type=_PATH, required=True, help="The observation.")
-@click.option("--truth", type=_PATH, help="The true scene, to compare parameters with.")
-def evaluate(scene: Path, video: Path, truth) -> None:
-    """Scores a scene against an observation, and against the true scene; prints JSON."""
-    from mjx_refine.observation import load_observation
-    from mjx_refine.scene import load_scene
-
-    judged, observation = load_scene(scene), load_observation(video)
-    true = None if truth is None else load_scene(truth)
-
-    from mjx_refine.evaluate import compare_scenes, evaluate_scene
-
-    with _about(scene):
-        report = evaluate_scene(judged, observation)
-    if true is not None:
-        report["truth"] = compare_scenes(judged, true, str(truth))
-    click.echo(json.dumps(report, indent=1))
-
-
 app.add_command(diagnose)
 app.add_command(describe)
 app.add_command(edit)
+app.add_command(evaluate)
