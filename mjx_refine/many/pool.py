@@ -9,7 +9,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
@@ -27,10 +27,15 @@ MOST_FALSE_STARTS = 3
 """Workers that may end before they are ready, since the last that was."""
 
 
+def cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def default_workers(options: Options) -> int | None:
     """How many processes: the cores for C MuJoCo; one for MJX, whose programs fill a device; None: ask a worker."""
     if options.backend == "mujoco" or (options.backend == "auto" and importlib.util.find_spec("warp") is None):
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return cores()
     return None if options.backend == "auto" else 1
 
 
@@ -40,7 +45,7 @@ class Pool:
     Args:
       waiting: the jobs.
       out: folder of all jobs.
-      options: of all jobs; with several workers, each computes with one thread.
+      options: of all jobs; several workers share the cores.
       workers: processes; None: the cores with C MuJoCo, one with MJX.
       progress: a display.
 
@@ -54,7 +59,7 @@ class Pool:
         self.count = workers or default_workers(options)
         self.workers: list[_Worker] = []
 
-    def outcomes(self) -> Iterator[Outcome]:
+    def outcomes(self) -> Generator[Outcome]:
         """Every job's outcome, as they end."""
         try:
             while self.waiting or any(worker.job for worker in self.workers):
@@ -74,7 +79,7 @@ class Pool:
         """Starts workers while there is work for them; a first one alone where the number depends on its device."""
         idle = sum(worker.job is None for worker in self.workers)
         while len(self.workers) < (self.count or 1) and idle < len(self.waiting):
-            self.workers.append(_Worker(self.out, self.options, single=self.count != 1))
+            self.workers.append(_Worker(self.out, self.options, self.count or 1))
             idle += 1
 
     def _heard(self, worker: _Worker) -> Outcome | None:
@@ -125,13 +130,15 @@ class Pool:
 
 
 class _Worker:
-    """One process, from outside."""
+    """One process, from outside; ``beside`` is how many there are in all."""
 
-    def __init__(self, out: Path, options: Options, single: bool):
+    def __init__(self, out: Path, options: Options, beside: int):
         context = multiprocessing.get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, out, options, single), daemon=True)
-        with _environment(ONE_THREAD if single else {}):
+        if beside > 1:
+            options = dataclasses.replace(options, threads=options.threads or max(1, cores() // beside))
+        self.process = context.Process(target=_serve, args=(theirs, out, options), daemon=True)
+        with _environment(ONE_THREAD if beside > 1 else {}):
             self.process.start()
         theirs.close()
         self.job: Job | None = None
@@ -174,12 +181,10 @@ def _how(code: int | None) -> str:
     return f"killed by signal {-code}"
 
 
-def _serve(pipe: Any, out: Path, options: Options, single: bool) -> None:
+def _serve(pipe: Any, out: Path, options: Options) -> None:
     """A worker process: a job in, its outcome out, until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends us
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    if single:
-        options = dataclasses.replace(options, threads=options.threads or 1)
     with contextlib.suppress(EOFError, OSError):
         try:
             pipe.send(("ready", resolve_backend(options.backend)))

@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ def ray_outcomes(
     workers: int | None,
     address: str | None,
     progress: ManyProgress,
-) -> Iterator[Outcome]:
+) -> Generator[Outcome]:
     """Every job's outcome, as they end.
 
     Args:
@@ -63,7 +63,7 @@ def ray_outcomes(
             ray.shutdown()
 
 
-def _outcomes(ray: Any, jobs: list[tuple[Job, Kind]], out: Path, options: Options, progress) -> Iterator[Outcome]:
+def _outcomes(ray: Any, jobs: list[tuple[Job, Kind]], out: Path, options: Options, progress) -> Generator[Outcome]:
     kinds = list(dict.fromkeys(kind for _, kind in jobs))
     task, needs = ray.remote(_task), _needs(options, ray.cluster_resources())
     how = {"max_retries": RETRIES, "runtime_env": {"env_vars": ONE_THREAD}, **needs}

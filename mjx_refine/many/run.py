@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 from mjx_refine.errors import InputError
@@ -64,7 +65,7 @@ def refine_many(
       jobs: what to refine, or the path of a ``jobs.yaml``.
       options: of all jobs; a job's overrides come before them.
       out: folder; a job writes in ``out / job.name`` what a refinement writes, and ``summary.csv`` has a row a job.
-      workers: processes with one thread each; by default the cores with C MuJoCo, one with MJX. A script that calls
+      workers: processes that share the cores; by default one a core with C MuJoCo, one with MJX. A script that calls
         this needs ``if __name__ == "__main__":``, since each process imports it. With
         ``ray``: cores of a cluster that is made here.
       resume: leave finished jobs alone and go on with unfinished ones from their checkpoints; jobs whose clip, samples
@@ -83,7 +84,7 @@ def refine_many(
     jobs = load_jobs(jobs) if isinstance(jobs, str | os.PathLike) else list(jobs)
     options, out, progress = options or Options(), Path(out), progress or ManyProgress()
     _check_call(jobs, workers, engine)
-    _check_folder(out, jobs)
+    _check_folder(out)
     outcomes: dict[str, Outcome] = {}
 
     def ended(outcome: Outcome) -> None:
@@ -95,19 +96,21 @@ def refine_many(
         ready: list[tuple[Job, Kind]] = []
         for job in jobs:
             try:
+                writable_directory(out / job.name, RESULTS)
                 ready.append((job, kind_of_job(load_scenes(job.init), job.video)))
                 if not resume:
                     cleared(out / job.name)
             except InputError as error:
                 ended(Outcome(job.name, BAD_INPUT, str(error)))
-        for outcome in _worked(engine, ready, out, options, workers, address, progress):
-            ended(outcome)
+        with contextlib.closing(_worked(engine, ready, out, options, workers, address, progress)) as worked:
+            for outcome in worked:
+                ended(outcome)
     finally:
         progress.close()
     return Many(out, tuple(outcomes[job.name] for job in jobs))
 
 
-def _worked(engine: str, ready: list, out: Path, options: Options, workers, address, progress) -> Iterator[Outcome]:
+def _worked(engine: str, ready: list, out: Path, options: Options, workers, address, progress) -> Generator[Outcome]:
     if engine == "ray":
         from mjx_refine.many.ray import ray_outcomes
 
@@ -125,10 +128,8 @@ def _check_call(jobs: list[Job], workers: int | None, engine: str) -> None:
         raise InputError(f"engine = {engine!r}; expected one of {', '.join(ENGINES)}")
 
 
-def _check_folder(out: Path, jobs: list[Job]) -> None:
+def _check_folder(out: Path) -> None:
     writable_directory(out, (SUMMARY,))
-    for job in jobs:
-        writable_directory(out / job.name, RESULTS)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -32,7 +32,9 @@ def whole(clips, tmp_path_factory):
     (out / "damaged.npz").write_bytes(b"PK\3\4")
     (out / "scene.yaml").write_text("- {type: cone}")
     jobs = [job_of(clips[0]), Job(clips[0] / "best32.yaml", out / "damaged.npz"), job_of(clips[1])]
+    (out / "taken").write_text("mine")
     jobs += [Job(out / "scene.yaml", clips[0] / "flows.npz", "cone")]
+    jobs += [Job(clips[0] / "best32.yaml", clips[0] / "flows.npz", "taken")]
     return out, jobs, refine_many(jobs, TINY, out=out, workers=2)
 
 
@@ -58,14 +60,17 @@ def test_what_cannot_be_refined_stops_no_other(whole):
         ("damaged", "bad input"),
         ("b", "done"),
         ("cone", "bad input"),
+        ("taken", "bad input"),
     ]
     assert "damaged.npz: not a readable npz" in many.outcomes[1].reason
     assert "entry 0.type = 'cone'" in many.outcomes[3].reason
+    assert "taken: " in many.outcomes[4].reason
+    assert (out / "taken").read_text() == "mine"
     assert many.status == 1
     assert not (out / "cone").exists()
     with open(out / "summary.csv") as stream:
         rows = {row["name"]: row for row in csv.DictReader(stream)}
-    assert list(rows) == ["a", "damaged", "b", "cone"]
+    assert list(rows) == ["a", "damaged", "b", "cone", "taken"]
     assert float(rows["b"]["iou_after"]) > float(rows["b"]["iou_before"]) > 0.3
     assert float(rows["b"]["fitness_after"]) == pytest.approx(
         float(rows["b"]["iou_after"]) - float(rows["b"]["epe_after"]), abs=0.3

@@ -1,5 +1,6 @@
 """Jobs as they are written, and the order in which they are worked through."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,9 @@ from mjx_refine.errors import InputError
 from mjx_refine.many import Job, jobs_of_pairs, load_jobs
 from mjx_refine.many.groups import Waiting, kind_of_job
 from mjx_refine.many.outcome import Outcome, result_of
+from mjx_refine.many.pool import _environment, default_workers
 from mjx_refine.many.run import Many
-from mjx_refine.many.work import cleared, work
+from mjx_refine.many.work import ONE_THREAD, cleared, work
 from mjx_refine.scene import load_scenes
 from mjx_refine.search import Options
 
@@ -174,6 +176,28 @@ def test_a_damaged_result_is_none(tmp_path):
 )
 def test_the_exit_status_of_the_whole(statuses, status):
     assert Many(Path("out"), tuple(Outcome(str(i), s) for i, s in enumerate(statuses))).status == status
+
+
+def test_a_child_s_environment_is_ours_again_after(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    with _environment(ONE_THREAD):
+        assert os.environ["OMP_NUM_THREADS"] == "7"  # what the user has set stays
+        assert "intra_op_parallelism_threads=1" in os.environ["XLA_FLAGS"]
+    assert "XLA_FLAGS" not in os.environ
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+
+
+@pytest.mark.parametrize(("backend", "count"), [("mujoco", len(os.sched_getaffinity(0))), ("mjx", 1), ("warp", 1)])
+def test_how_many_workers(backend, count):
+    assert default_workers(Options(backend=backend)) == count
+
+
+def test_how_many_workers_where_warp_is_installed(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: object())
+    assert default_workers(Options()) is None  # only a worker may ask for a GPU: it would keep its memory
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert default_workers(Options()) == len(os.sched_getaffinity(0))
 
 
 def test_the_live_line():
