@@ -12,6 +12,14 @@ from mjx_refine.errors import InputError
 _PATH = click.Path(path_type=Path)
 
 
+def _print_forms(context: click.Context, _: click.Parameter, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
+        from mjx_refine.edit import FORMS
+
+        click.echo("\n".join(FORMS))
+        context.exit()
+
+
 @click.command(context_settings={"show_default": True})
 @click.argument("scene", type=_PATH)
 @click.argument("instruction")
@@ -21,6 +29,9 @@ _PATH = click.Path(path_type=Path)
 @click.option("--size", type=Size(), default="480x320", help="Of preview and flow.")
 @click.option("--frames", type=click.IntRange(2, 10000), default=30, help="Of preview and flow.")
 @click.option("--fps", type=FiniteFloat(0.1, 1e5), default=30.0, help="Of preview and flow.")
+@click.option(
+    "--forms", is_flag=True, is_eager=True, expose_value=False, callback=_print_forms, help="List what can be said."
+)
 def edit(scene: Path, instruction: str, out: Path, preview, flow, size, frames: int, fps: float) -> None:
     """Changes a scene as an instruction says, and shows the changed lines.
 

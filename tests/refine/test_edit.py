@@ -323,6 +323,11 @@ def test_bad_calls_leave_nothing_behind(arguments, says, folder, capsys):
     assert sorted(p.name for p in folder.rglob("*")) == ["full", "mine", "scene.yaml"]
 
 
+def test_the_forms_can_be_listed(capsys):
+    assert run(["edit", "--forms"]) == 0
+    assert capsys.readouterr().out.splitlines() == FORMS
+
+
 def test_preview_and_flow(folder):
     call = [
         "edit",
