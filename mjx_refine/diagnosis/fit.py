@@ -12,7 +12,7 @@ from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, settled
 from mjx_refine.diagnosis.predict import Prediction, Predictor
-from mjx_refine.diagnosis.slack import Slack, impacts, kicked, slack_of
+from mjx_refine.diagnosis.slack import BIAS, Slack, impacts, kicked, slack_of, sustained, touching
 from mjx_refine.search.landing import slowed
 from mjx_refine.sim.backends import Simulator
 
@@ -102,27 +102,43 @@ class ClipFit:
         self._slacks: dict[bytes | None, Slack] = {}
 
     def allow_slack(self, fit: Fit) -> int:
-        """Lets the impacts of a base model's fit err from now on; returns how many there are."""
+        """Lets contacts of a base model's fit err from now on, and masks be a little wide; returns how many impacts there
+        are."""
         batch = fit.hypothesis.batch(fit.z[None])
         poses = self.poses(fit.hypothesis, fit.z[None])[0]
         self._columns, self._slacks = None, {}
         if not np.isfinite(poses).all():
             return 0
+        still = self.predictor(poses[None], batch)
         found = impacts(batch, poses, self.simulator.fps)
-        if not found:
-            return 0
-        rows = kicked(self.simulator, batch, poses, found)
-        self.rollouts += len(rows)
-        many = batch.map(lambda a: np.repeat(a[:1], len(rows), 0))
-        moved, still = self.predictor(rows, many), self.predictor(poses[None], batch)
-        parts = [
-            np.where(np.isfinite(measured)[None], np.nan_to_num(a - b), 0.0)
-            for a, b, measured in zip(moved.parts, still.parts, self.measured.parts, strict=True)
-        ]
         self.noise = blurred(self.noise, still.moments[0], [(i.target, i.frame) for i in found])
-        columns = self.whitened(Parts(*parts), None, 1e9)
-        self._columns = columns[~moved.bad].T
+        long = sustained(batch, poses, touching(batch, poses), self.simulator.fps)
+        columns = [self.whitened(self._wide(), None, 1e9)]
+        if found or long:
+            rows = kicked(self.simulator, batch, poses, [*found, *long])
+            self.rollouts += len(rows)
+            many = batch.map(lambda a: np.repeat(a[:1], len(rows), 0))
+            moved = self.predictor(rows, many)
+            columns.append(self.whitened(self._change(moved, still), None, 1e9)[~moved.bad])
+        self._columns = np.concatenate(columns).T
         return len(found)
+
+    def _change(self, moved: Prediction, still: Prediction) -> Parts:
+        """From one prediction to others [px], zero where nothing was measured."""
+        return Parts(
+            *(
+                np.where(np.isfinite(measured)[None], np.nan_to_num(a - b), 0.0)
+                for a, b, measured in zip(moved.parts, still.parts, self.measured.parts, strict=True)
+            )
+        )
+
+    def _wide(self) -> Parts:
+        """Masks that are too wide by one standard deviation, a row an object [px]."""
+        parts = Parts(*(np.zeros((self.measured.reach.shape[1], *part.shape)) for part in self.measured.parts))
+        for n in range(len(parts.reach)):
+            parts.reach[n, :, n] = np.where(np.isfinite(self.measured.reach[:, n]), BIAS[0], 0.0)
+            parts.moments[n, :, n, 2] = np.where(np.isfinite(self.measured.moments[:, n, 2]), BIAS[1], 0.0)
+        return parts
 
     def settle_noise(self, fit: Fit) -> None:
         """Sets the noise to what changes from frame to frame in the residuals of a fit, which no smooth misfit does."""
@@ -190,7 +206,8 @@ class ClipFit:
     ) -> Float[np.ndarray, "batch residuals"]:
         """Robust residuals in noise widths; zero where nothing was measured, and in frames that are not kept."""
         noise, counts = self.noise, self.counts.of(distances)
-        widths = (noise.edge[:, :, None], noise.flow[:, :, None, None], noise.moments, np.array(noise.background))
+        slow = self.measured.freshness[:, :, None] ** -0.5
+        widths = (noise.edge[:, :, None] * slow, noise.flow[:, :, None, None], noise.moments * slow, noise.background)
         parts = [
             slowed(np.nan_to_num(raw) / sigma, scale * patience) * np.sqrt(count)
             for raw, sigma, count, patience in zip(distances, widths, counts, PATIENCE, strict=True)
@@ -203,9 +220,12 @@ class ClipFit:
 
     def expected(self, beside: bool = True) -> float:
         """Sum of squares that noise alone would give, with the background's or without."""
-        parts = self.measured.parts
-        seen = [float(np.isfinite(part).sum()) for part in parts]
-        each = [count * number for count, number in zip(self.counts.of(parts), seen, strict=True)]
+        parts, fresh = self.measured.parts, self.measured.freshness
+        seen = [np.isfinite(part) for part in parts]
+        total = [float(np.sum(part)) for part in seen]
+        total[0] = float((seen[0].sum(-1) * fresh).sum())
+        total[2] = float((seen[2].sum(-1) * fresh).sum())
+        each = [count * number for count, number in zip(self.counts.of(parts), total, strict=True)]
         return max(sum(each if beside else each[:-1]), 1.0)
 
     def misfit(self, fit: Fit) -> float:

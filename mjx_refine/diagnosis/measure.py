@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +25,9 @@ EDGE_FLOOR, FLOW_FLOOR = 0.3, 0.15
 MOMENT_FLOOR = 0.05
 """Noise of centroids and of the radius that a mask's area is worth, that is assumed at least [px]: pixels average over an
 outline, whole ones as they are."""
+
+FRESH, STALE = 1.0, 0.1
+"""Speed from which on every frame tells something new of a mask [px/frame], and what one counts that does not move."""
 
 FLOW_PART = 0.08
 """Error of measured flow that is smooth over an object, as a part of its motion; half where its noise is stated."""
@@ -79,6 +84,16 @@ class Measured:
     moment_noise: Float[np.ndarray, "objects 3"]
     background_noise: float
     stated: bool
+
+    @functools.cached_property
+    def freshness(self) -> Float[np.ndarray, "frames objects"]:
+        """How much of a new measurement each mask is: the same pixels say the same while nothing moves by one."""
+        speed = np.full(self.present.shape, np.nan)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            speed[:-1] = np.nanmedian(np.linalg.norm(self.flow, axis=-1), -1)
+        speed[-1] = speed[-2] if len(speed) > 1 else np.nan
+        return np.clip(np.nan_to_num(speed, nan=1.0) / FRESH, STALE, 1.0)
 
     @property
     def parts(self) -> Parts:

@@ -13,7 +13,7 @@ EDGE_COUNT, FLOW_COUNT, BACKGROUND_COUNT = 6.0, 3.0, 6.0
 """As how many independent numbers the directions of one outline, the flow of one mask (each axis) and that of the
 background (each axis) count in one frame, since neighbours err together; the first two until they are measured."""
 
-EDGE_COUNTS, FLOW_COUNTS = (4.0, 12.0), (1.5, 10.0)
+EDGE_COUNTS, FLOW_COUNTS = (3.0, 6.0), (1.5, 10.0)
 """Bounds of these counts where they are measured."""
 
 LEAST_EDGE = 0.12
@@ -97,9 +97,12 @@ def settled(measured: Measured, residual: Parts, counts: Counts) -> tuple[Measur
       counts: which the residuals were weighted with.
     """
     m, share = measured, counts.of(measured.parts)
+    fresh = m.freshness > 0.5
 
     def rough(series: np.ndarray, seen: np.ndarray, part: float) -> np.ndarray:
-        step = np.where(np.isfinite(seen), series, np.nan)
+        # Masks that stand still say nothing of their noise.
+        moving = fresh[: len(series)].reshape(*fresh[: len(series)].shape, *(1,) * (series.ndim - 2))
+        step = np.where(np.isfinite(seen) & moving, series, np.nan)
         square = np.diff(step, axis=0) ** 2 / 2 / part
         return np.array([np.sqrt(_middle(square[:, n]) / 0.455) for n in range(series.shape[1])])
 

@@ -9,14 +9,16 @@ and one that it cannot explain costs what it did.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch, concatenate
 from mjx_refine.sim.backends import Simulator
 from mjx_refine.sim.model import SUBSTEPS
+from mjx_refine.space.layout import lowest_extent
 
 PART = 0.08
 """Standard deviation of an impulse's error, as a part of the change of velocity (and, times a radius, of spin)."""
@@ -26,6 +28,15 @@ LEAST = 0.25
 
 MOST = 8
 """Impacts an object that are looked at, strongest first."""
+
+
+PHASES, SHORTEST, STEADY = 3, 6, 0.35
+"""Into how many parts a time on the floor is cut, how many frames it must last, and how large the error of the change of
+velocity in each is against that of an impact."""
+
+BIAS = (0.5, 0.15)
+"""Standard deviations of what masks are too wide by, by object: of outlines, whose farthest pixel noise moves outward, and
+of equivalent radii [px]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +93,36 @@ def impacts(batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], fps
         strength = np.where(held, 0.0, change) + 0.5 * turn
         frames = [t for t in np.argsort(-strength) if strength[t] > LEAST][:MOST]
         found += [Impact(n, int(t) + 1, float(change[t]), float(turn[t])) for t in frames]
+    return found
+
+
+def touching(batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"]) -> Bool[np.ndarray, "frames objects"]:
+    """Which bodies of the first candidate touch the floor."""
+    lowest = [
+        np.broadcast_to(lowest_extent(s, batch.size[0, n][None], poses[:, n, 3:]), len(poses))
+        for n, s in enumerate(batch.shapes)
+    ]
+    return poses[..., 2] - np.stack(lowest, 1) < 0.01
+
+
+def sustained(
+    batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], on_floor: np.ndarray, fps: float
+) -> list[Impact]:
+    """Times on the floor, in parts, each as an impact in its middle: engines slow bodies down in their own ways."""
+    velocity = np.diff(poses[..., :3], axis=0) * fps
+    found = []
+    for n in range(poses.shape[1]):
+        touching = np.concatenate([[False], on_floor[:, n], [False]])
+        edges = np.nonzero(np.diff(touching.astype(int)))[0]
+        for first, end in zip(edges[::2], edges[1::2], strict=True):
+            if end - first < SHORTEST:
+                continue
+            borders = np.linspace(first, min(end, len(velocity)) - 1, PHASES + 1).astype(int)
+            for a, b in itertools.pairwise(borders):
+                change = float(np.linalg.norm((velocity[b] - velocity[a])[n, :2]))
+                speed = float(np.linalg.norm(velocity[a, n, :2]))
+                if speed > 0.02:
+                    found.append(Impact(n, int((a + b + 1) // 2), STEADY * max(change, 0.1 * speed), 0.0))
     return found
 
 

@@ -90,7 +90,7 @@ def _persistence(residual: np.ndarray, seen: np.ndarray) -> float:
     steps = np.diff(series, axis=0)
     if np.isfinite(means).sum() < 6:
         return np.nan
-    return float(5 * np.nanmean(means**2) / max(float(np.nanmean(steps**2)) / 2, 1e-6))
+    return float(5 * np.nanmean(means**2) / max(float(np.nanmean(steps**2)) / 2, 1.0))
 
 
 LITTLE = 15.0

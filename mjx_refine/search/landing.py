@@ -135,11 +135,7 @@ class LeastSquares:
         self.limit, self.seed, self.solver, self.automatic = limit, seed, solver, automatic
         self.space, self.rollout, self.image, self.fps = space, rollout, image, fps
         self.pixel = image[0] / 480.0
-        target = np.full((len(seen.support), len(columns), DIRECTIONS), np.nan)
-        for n, j in enumerate(columns):
-            if j >= 0:
-                target[:, n] = seen.support[:, j]
-        self.target = target
+        self.target = _of_columns(seen.support, columns)
         self.pixels, self.flow = _of_objects(flow, columns)
         self.whole = None if whole is None else _of_columns(whole, columns)
         self.step = STEP if whole is None else FINE_STEP
@@ -176,11 +172,9 @@ class LeastSquares:
         flow at its points are independent: its directions together count as six, its flow as two vectors.
         """
         edges = slowed(np.nan_to_num(reach), scale) * EDGE_WEIGHT
-        if self.whole is None:
-            motion = slowed(np.nan_to_num(flow), FLOW_SCALE) * MOTION_WEIGHT
-            return np.concatenate([edges, motion], -1)
-        motion = slowed(np.nan_to_num(flow[..., :-3]), FLOW_SCALE) * MOTION_WEIGHT
-        moments = slowed(np.nan_to_num(flow[..., -3:]), scale) * MOMENT_WEIGHT
+        points = flow.shape[-1] - (0 if self.whole is None else 3)
+        motion = slowed(np.nan_to_num(flow[..., :points]), FLOW_SCALE) * MOTION_WEIGHT
+        moments = slowed(np.nan_to_num(flow[..., points:]), scale) * MOMENT_WEIGHT
         return np.concatenate([edges, motion, moments], -1)
 
     def residuals(self, points: np.ndarray, frames: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
