@@ -72,6 +72,8 @@ class Pool:
                         yield outcome
                 self._show()
         finally:
+            for worker in self.workers:  # first all are told, so that they end side by side
+                worker.pipe.close()
             for worker in self.workers:
                 worker.end()
 
