@@ -27,6 +27,9 @@ FAMILIES = 7
 FRESH = 6
 """Ditto that are fitted from the given scene as well."""
 
+RIVALS = 4
+"""Runners-up that are fitted again from where the best effect's fit ended."""
+
 FORGIVING = 40.0
 """Scale of the robust loss while a fit is far off [noise widths]."""
 
@@ -142,10 +145,25 @@ def _singles(
         if other.cost > base.cost - 1.0:
             break
         base = other
+    _from_the_best(clip, base, fitted)
     finals = [Candidate(fit, fit.evidence - base.evidence, promise) for fit, promise in fitted.values()]
     finals.sort(key=lambda c: -c.lead)
     finals = [_polished(clip, c, base) for c in finals[:2]] + finals[2:]
     return base, tuple(sorted(finals, key=lambda c: -c.lead))
+
+
+def _from_the_best(clip: ClipFit, base: Fit, fitted: dict) -> None:
+    """Runners-up once more from the base parameters that the best effect's fit found: one basin is fair to all."""
+    ordered = sorted(fitted, key=lambda key: -fitted[key][0].evidence)
+    best = fitted[ordered[0]][0] if ordered else base
+    count = base.hypothesis.dimension
+    for key in ordered[1 : 1 + RIVALS]:
+        fit, promise = fitted[key]
+        if fit.evidence < base.evidence + 0.1 * (best.evidence - base.evidence):
+            break
+        again = clip.fit(fit.hypothesis, np.concatenate([best.z[:count], fit.z[count:]]), 8)
+        if again.evidence > fit.evidence:
+            fitted[key] = (again, promise)
 
 
 def _polished(clip: ClipFit, candidate: Candidate, base: Fit) -> Candidate:

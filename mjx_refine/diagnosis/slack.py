@@ -30,9 +30,12 @@ MOST = 8
 """Impacts an object that are looked at, strongest first."""
 
 
-PHASES, SHORTEST, STEADY = 3, 6, 0.35
-"""Into how many parts a time on the floor is cut, how many frames it must last, and how large the error of the change of
-velocity in each is against that of an impact."""
+PHASES, SHORTEST = 3, 6
+"""Into how many parts a time on the floor is cut, and how many frames it must last."""
+
+SLIDING, ROLLING = (0.35, 0.1), (1.0, 0.05)
+"""How large the error of the change of velocity in each is against that of an impact, and the least part of the speed that
+is taken for a change: every engine has a law of its own for rolling friction."""
 
 BIAS = (0.5, 0.15)
 """Standard deviations of what masks are too wide by, by object: of outlines, whose farthest pixel noise moves outward, and
@@ -109,9 +112,12 @@ def sustained(
     batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], on_floor: np.ndarray, fps: float
 ) -> list[Impact]:
     """Times on the floor, in parts, each as an impact in its middle: engines slow bodies down in their own ways."""
-    velocity = np.diff(poses[..., :3], axis=0) * fps
+    velocity, spin = np.diff(poses[..., :3], axis=0) * fps, spins(poses, fps)
     found = []
     for n in range(poses.shape[1]):
+        rim = np.linalg.norm(spin[:, n], axis=-1) * float(batch.size[0, n, 0])
+        rolls = batch.shapes[n] != "box" and bool(np.median(rim - 0.5 * np.linalg.norm(velocity[:, n], axis=-1)) > 0)
+        share, least = ROLLING if rolls else SLIDING
         touching = np.concatenate([[False], on_floor[:, n], [False]])
         edges = np.nonzero(np.diff(touching.astype(int)))[0]
         for first, end in zip(edges[::2], edges[1::2], strict=True):
@@ -122,7 +128,7 @@ def sustained(
                 change = float(np.linalg.norm((velocity[b] - velocity[a])[n, :2]))
                 speed = float(np.linalg.norm(velocity[a, n, :2]))
                 if speed > 0.02:
-                    found.append(Impact(n, int((a + b + 1) // 2), STEADY * max(change, 0.1 * speed), 0.0))
+                    found.append(Impact(n, int((a + b + 1) // 2), share * max(change, least * speed), 0.0))
     return found
 
 
