@@ -90,6 +90,7 @@ def compare(
     without: tuple[str, ...],
     seed: int,
     told: Told,
+    begin: Callable[[], Fit] | None = None,
 ) -> Compared:
     """Fits the base model, then what the linear look promises.
 
@@ -101,9 +102,10 @@ def compare(
       without: effects that are left out of the catalogue.
       seed: of random hops.
       told: called with a line for each step.
+      begin: makes the base model's first fit, where not pictures but poses were measured.
     """
     told("base model")
-    base = fit_base(clip, base_space(scene), observation, masks_of)
+    base = begin() if begin is not None else fit_base(clip, base_space(scene), observation, masks_of)
     clip.settle_noise(base)
     clip.allow_chaos(base, seed)
     impacts = clip.allow_slack(base)
