@@ -21,8 +21,8 @@ _KEYS = ("flow", "masks", "fps", "frames", "flow_sigma")
 MAX_ELEMENTS = 2 * 10**9
 MAX_FLOW = 1e5
 _READERS = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
-_DAMAGED = (OSError, ValueError, EOFError, KeyError, TypeError, SyntaxError, RuntimeError, MemoryError, OverflowError)
-_DAMAGED += (zipfile.BadZipFile, zlib.error, lzma.LZMAError)
+DAMAGED = (OSError, ValueError, EOFError, KeyError, TypeError, SyntaxError, RuntimeError, MemoryError, OverflowError)
+DAMAGED += (zipfile.BadZipFile, zlib.error, lzma.LZMAError)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,14 +67,14 @@ def load_observation(path: str | os.PathLike) -> Observation:
       InputError: the file is missing, no npz, holds pickles, or its arrays do not fit together.
     """
     path = Path(path)
-    _check_sizes(path)
+    check_sizes(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
             _check_keys(path, archive.files)
             arrays = {key: archive[key] for key in archive.files}
     except InputError:
         raise
-    except _DAMAGED as error:
+    except DAMAGED as error:
         reason = (
             "it holds pickled objects"
             if "allow_pickle" in str(error) or "Object arrays" in str(error)
@@ -93,7 +93,7 @@ def _check_keys(path: Path, keys: list[str]) -> None:
             raise InputError(f"{path}: the key {key!r} is missing; found {', '.join(keys)[:200] or 'nothing'}; add it")
 
 
-def _check_sizes(path: Path) -> None:
+def check_sizes(path: Path) -> None:
     """Refuses headers that promise more than memory holds, before anything is read."""
     try:
         if not path.is_file():
@@ -102,7 +102,7 @@ def _check_sizes(path: Path) -> None:
             need = sum(_declared_bytes(path, archive, info) for info in archive.infolist())
     except InputError:
         raise
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise InputError(
             f"{path}: not a readable npz of plain arrays ({str(error)[:200]}); write it with numpy.savez"
         ) from error

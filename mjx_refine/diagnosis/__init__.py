@@ -1,6 +1,20 @@
 """Diagnosis: where a simulation and a clip part, which unmodelled effect parts them, and how far it closes the gap."""
 
 from mjx_refine.diagnosis.diagnose import diagnose
+from mjx_refine.diagnosis.poses import Poses, diagnose_poses, load_poses, make_poses
 from mjx_refine.diagnosis.result import CHANNELS, Diagnosis, Gap, Place, Ranked, Value, Verdict
 
-__all__ = ["CHANNELS", "Diagnosis", "Gap", "Place", "Ranked", "Value", "Verdict", "diagnose"]
+__all__ = [
+    "CHANNELS",
+    "Diagnosis",
+    "Gap",
+    "Place",
+    "Poses",
+    "Ranked",
+    "Value",
+    "Verdict",
+    "diagnose",
+    "diagnose_poses",
+    "load_poses",
+    "make_poses",
+]

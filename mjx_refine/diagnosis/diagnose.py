@@ -109,7 +109,7 @@ def _check_motion(reach: np.ndarray, observation: Observation) -> None:
 # --- the answer -------------------------------------------------------------------------------------------------------
 
 
-def _verdict(compared: Compared, said: Answer, names: tuple[str, ...], shapes) -> tuple[Verdict, Candidate | None]:
+def verdict_of(compared: Compared, said: Answer, names: tuple[str, ...], shapes) -> tuple[Verdict, Candidate | None]:
     """The likeliest answer, and the hypothesis behind it."""
     by_name = _by_name(compared, said)
     if said.kind == "none":
@@ -157,7 +157,7 @@ def _result(
 ) -> Diagnosis:
     base = compared.base
     names, shapes = base.hypothesis.space.scene.names, base.hypothesis.space.scene.shapes
-    verdict, best = _verdict(compared, said, names, shapes)
+    verdict, best = verdict_of(compared, said, names, shapes)
     shown = best.fit if best else base
     overall = best_candidate(compared)
     if best is not None and (overall is None or best is not overall):
@@ -174,7 +174,7 @@ def _result(
         verdict=verdict,
         gap=gap,
         where=places(clip, base, best.fit if best else None, view),
-        candidates=tuple(_ranked(clip, compared, said, outside, best)),
+        candidates=tuple(ranked(clip, compared, said, outside, best)),
         residual=describe(clip, base, view_of(clip, base, observation, matching, hidden=False)),
         remaining=describe(clip, shown, view),
         base=before_scene,
@@ -211,7 +211,7 @@ def _gap(outside: HeldOut, scores, seed: int) -> Gap:
     )
 
 
-def _ranked(clip: ClipFit, compared: Compared, said: Answer, outside: HeldOut, best: Candidate | None) -> list[Ranked]:
+def ranked(clip: ClipFit, compared: Compared, said: Answer, outside: HeldOut, best: Candidate | None) -> list[Ranked]:
     """Every fitted effect, the likeliest first; of two at work, both with the parameters of their common fit."""
     names, shapes = compared.base.hypothesis.space.scene.names, compared.base.hypothesis.space.scene.shapes
     rows: list[Ranked] = []

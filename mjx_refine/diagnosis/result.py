@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Float
@@ -54,7 +55,10 @@ class Gap:
       noise_floor: what the measurement's noise alone gives.
       closed: (before - after) / (before - noise_floor).
       closed_low, closed_high: its 90 % bootstrap interval.
-      iou_before, iou_after, epe_before, epe_after: full-resolution scores of the whole clip.
+      iou_before, iou_after, epe_before, epe_after: full-resolution scores of the whole clip; NaN without pictures.
+      position_before, position_after: where poses were measured, root mean square errors of positions on held-out samples
+        [m]; otherwise NaN.
+      rotation_before, rotation_after: ditto of rotations [rad].
     """
 
     metric: str
@@ -69,6 +73,10 @@ class Gap:
     iou_after: float
     epe_before: float
     epe_after: float
+    position_before: float = math.nan
+    position_after: float = math.nan
+    rotation_before: float = math.nan
+    rotation_after: float = math.nan
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,6 +124,25 @@ class Verdict:
 
 
 @dataclasses.dataclass(frozen=True)
+class PoseErrors:
+    """How far measured poses are from the simulated ones; NaN where not measured.
+
+    Attributes:
+      time: since the first sample [s].
+      position: of the base model, refitted [m].
+      rotation: ditto [rad].
+      position_after: of the diagnosed scene [m].
+      rotation_after: ditto [rad].
+    """
+
+    time: Float[np.ndarray, "times"]
+    position: Float[np.ndarray, "times objects"]
+    rotation: Float[np.ndarray, "times objects"]
+    position_after: Float[np.ndarray, "times objects"]
+    rotation_after: Float[np.ndarray, "times objects"]
+
+
+@dataclasses.dataclass(frozen=True)
 class Diagnosis:
     """All that a diagnosis found.
 
@@ -136,6 +163,7 @@ class Diagnosis:
       signs: the numbers that the probabilities were read from.
       seconds: how long it took.
       rollouts: how many were simulated.
+      pose_errors: where poses were measured, not pictures.
     """
 
     verdict: Verdict
@@ -154,6 +182,7 @@ class Diagnosis:
     signs: dict[str, float]
     seconds: float
     rollouts: int
+    pose_errors: PoseErrors | None = None
 
 
 CHANNELS = ("motion", "rotation", "shape", "camera", "timing", "perception")

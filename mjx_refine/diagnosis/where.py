@@ -53,15 +53,27 @@ def places(clip: ClipFit, base: Fit, best: Fit | None, view: FitView) -> tuple[P
       best: the fit with the verdict's effects, which say where they act; None where there are none.
       view: of the fit that says it (``best`` or ``base``).
     """
-    energy, channel, beside = misfit_map(clip, base)
+    after = None if best is None else misfit_map(clip, best)[0]
+    return places_of(misfit_map(clip, base), after, base, best, view)
+
+
+def places_of(
+    before: tuple[np.ndarray, np.ndarray, np.ndarray],
+    after: np.ndarray | None,
+    base: Fit,
+    best: Fit | None,
+    view: FitView,
+) -> tuple[Place, ...]:
+    """Where the gap is, from maps as ``misfit_map`` makes them; ``after``: of ``best``, the first of the three."""
+    energy, channel, beside = before
     excess = np.maximum(_smooth(energy) - 1.0, 0.0)
     extra = np.maximum(beside - 1.0, 0.0)
     total = float(excess.sum() + extra.sum())
     names = base.hypothesis.space.scene.names
     found: list[Place] = []
-    if best is not None:
-        after = np.maximum(_smooth(misfit_map(clip, best)[0]) - 1.0, 0.0)
-        gained = float(np.maximum(excess - after, 0.0).sum()) + float(extra.sum())
+    if best is not None and after is not None:
+        left = np.maximum(_smooth(after) - 1.0, 0.0)
+        gained = float(np.maximum(excess - left, 0.0).sum()) + float(extra.sum())
         share = min(0.99, gained / total) if total > 0 else 0.0
         found = _acting(best, view, names, channel, excess, share)
     used = sum(p.share for p in found)
@@ -73,7 +85,7 @@ def places(clip: ClipFit, base: Fit, best: Fit | None, view: FitView) -> tuple[P
                 kind = CHANNELS[int(np.bincount(channel[n, first : last + 1]).argmax())]
                 found.append(Place(name, (first, last), phase_of(view, n, first, last), kind, part))
     if extra.sum() > 0.05 * total and total > 0 and best is None:
-        found.append(Place(None, (0, clip.frames - 1), "whole", "camera", float(extra.sum()) / total * (1 - used)))
+        found.append(Place(None, (0, view.frames - 1), "whole", "camera", float(extra.sum()) / total * (1 - used)))
     found.sort(key=lambda p: -p.share)
     return tuple(found[:8])
 

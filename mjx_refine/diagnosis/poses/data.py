@@ -218,8 +218,6 @@ def _sigma(value: float | np.ndarray | None, key: str, source: str) -> float | N
 LEAST_POS, LEAST_ROT = 1e-4, 1e-3
 """Noise that is assumed at least where it is not stated [m], [rad]: no tracker is better, however smooth its output."""
 
-CUBIC = np.array([-1.0, 3.0, -3.0, 1.0]) / np.sqrt(20.0)
-
 
 def noise_of(poses: Poses) -> tuple[Float[np.ndarray, "objects 3"], Float[np.ndarray, "objects"]]:
     """Standard deviations of positions by axis [m] and of rotations [rad]: as stated, else from third differences in time.
@@ -234,7 +232,9 @@ def noise_of(poses: Poses) -> tuple[Float[np.ndarray, "objects 3"], Float[np.nda
         place = np.full_like(place, poses.sigma_pos)
     if poses.sigma_rot is not None:
         rot = np.full_like(rot, poses.sigma_rot)
-    return np.maximum(place, LEAST_POS * (poses.sigma_pos is None)), np.maximum(rot, LEAST_ROT * (poses.sigma_rot is None))
+    return np.maximum(place, LEAST_POS * (poses.sigma_pos is None)), np.maximum(
+        rot, LEAST_ROT * (poses.sigma_rot is None)
+    )
 
 
 def third_differences(time: Float[np.ndarray, "times"]) -> Float[np.ndarray, "windows 4"]:
