@@ -25,7 +25,7 @@ RESULTS = ("diagnosed.yaml", "report.html", "diagnosis.json")
 @click.option(
     "--video", type=_PATH, multiple=True, help="Its clip (npz); give --init and --video again for another clip."
 )
-@click.option("--poses", type=_PATH, help="Measured poses (npz with time, pos, quat) instead of a clip.")
+@click.option("--poses", type=_PATH, multiple=True, help="Measured poses (npz with time, pos, quat) instead of a clip.")
 @click.option("--out", type=_PATH, required=True, help="Folder for the results.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Of everything random.")
 @click.option("--without", multiple=True, metavar="EFFECT", help="An effect to leave out; may be given again.")
@@ -36,6 +36,8 @@ def diagnose(context: click.Context, init, video, poses, out: Path, seed: int, w
     """Says what a scene's simulation lacks to replay a clip: where they part, which effect it is, how far it helps.
 
     refine diagnose --init refined.yaml --video flows.npz --out diagnosis
+
+    refine diagnose --init scene.yaml --poses poses.npz --out diagnosis
     """
     _check_call(context, init, video, poses)
     withheld = _withheld(without)
@@ -65,19 +67,20 @@ def diagnose(context: click.Context, init, video, poses, out: Path, seed: int, w
     click.echo(f"{diagnosis.verdict.sentence} (probability {diagnosis.verdict.probability:.2f}); {out}/report.html")
 
 
-def _check_call(context: click.Context, init: Sequence[Path], video: Sequence[Path], poses: Path | None) -> None:
+def _check_call(context: click.Context, init: Sequence[Path], video: Sequence[Path], poses: Sequence[Path]) -> None:
     """Refuses a call whose options do not go together."""
     if not init:
         raise click.UsageError("Missing option '--init'", ctx=context)
-    if poses is not None and video:
+    if poses and video:
         raise click.UsageError("--poses and --video: expected one of them; leave one out", ctx=context)
-    if poses is None and not video:
+    if not poses and not video:
         raise click.UsageError("Missing option '--video' (or '--poses')", ctx=context)
-    if poses is not None and len(init) != 1:
+    if poses and (len(init) != 1 or len(poses) != 1):
         raise click.UsageError(
-            f"{len(init)} --init with --poses; expected one; give the scene of the poses", ctx=context
+            f"{len(init)} --init and {len(poses)} --poses; expected one of each; diagnose each recording by itself",
+            ctx=context,
         )
-    if poses is None and len(init) != len(video):
+    if not poses and len(init) != len(video):
         raise click.UsageError(
             f"{len(init)} --init and {len(video)} --video; expected as many of each, in the same order; "
             "give a --video after every --init",
@@ -105,18 +108,20 @@ class Inputs:
       samples: what they hold, see ``mjx_refine.scene.Samples``.
       video: the clips' files.
       observations: the clips.
-      poses: file of measured poses, or None.
+      poses: files of measured poses.
+      recorded: the measured poses.
     """
 
     init: tuple[Path, ...]
     samples: tuple
     video: tuple[Path, ...]
     observations: tuple
-    poses: Path | None
+    poses: tuple[Path, ...]
+    recorded: tuple
 
     @classmethod
-    def read(cls, init: Sequence[Path], video: Sequence[Path], poses: Path | None) -> Inputs:
-        """Reads scenes and clips, and tells of samples that were left out.
+    def read(cls, init: Sequence[Path], video: Sequence[Path], poses: Sequence[Path]) -> Inputs:
+        """Reads scenes, clips and poses, and tells of samples that were left out.
 
         Raises:
           InputError: a file is missing or wrong.
@@ -126,23 +131,26 @@ class Inputs:
 
         samples = tuple(load_scenes(path) for path in init)
         observations = tuple(load_observation(path) for path in video)
-        if poses is not None and not poses.is_file():
-            raise InputError(f"{poses}: no such file; expected measured poses (npz with time, pos, quat)")
+        recorded: tuple = ()
+        if poses:
+            from mjx_refine.diagnosis import load_poses
+
+            recorded = tuple(load_poses(path) for path in poses)
         for one in samples:
             for problem in one.problems:
                 click.echo(f"refine: left out: {problem.reason}", err=True)
-        return cls(tuple(init), samples, tuple(video), observations, poses)
+        return cls(tuple(init), samples, tuple(video), observations, tuple(poses), recorded)
 
     def call(self, seed: int, without: tuple[str, ...]) -> dict[str, Any]:
         """What was asked for, with a fingerprint of the files and of the options that change the result."""
-        paths = [*self.init, *self.video, *([] if self.poses is None else [self.poses])]
+        paths = [*self.init, *self.video, *self.poses]
         state = hashlib.sha256(repr((len(self.init), seed, sorted(without))).encode())
         for path in paths:
             with open(path, "rb") as stream:
                 state.update(hashlib.file_digest(stream, "sha256").digest())
         call: dict[str, Any] = {"init": [path.name for path in self.init], "video": [path.name for path in self.video]}
-        if self.poses is not None:
-            call["poses"] = self.poses.name
+        if self.poses:
+            call["poses"] = self.poses[0].name
         return {**call, "seed": seed, "without": list(without), "digest": state.hexdigest()}
 
 
@@ -172,9 +180,8 @@ def _diagnosed(inputs: Inputs, call: dict[str, Any], without, seed: int, threads
     from mjx_refine import diagnosis
 
     options = {"without": without, "seed": seed, "threads": threads, "told": told}
-    if inputs.poses is not None:
-        function = _function(diagnosis, "diagnose_poses", "--poses", "give a clip with --video")
-        return function(_only(inputs.samples[0]), inputs.poses, **options), call, None
+    if inputs.poses:
+        return diagnosis.diagnose_poses(_only(inputs.samples[0]), inputs.recorded[0], **options), call, None
     several = len(inputs.observations) > 1
     function = _function(
         diagnosis,

@@ -74,6 +74,8 @@ def _gap(gap: Gap) -> dict[str, Any]:
     values = {
         name: _significant(value, _DIGITS) if isinstance(value, float) else value
         for name, value in dataclasses.asdict(gap).items()
+        # Errors in metres and radians are there where poses were measured, and only there.
+        if not (name.startswith(("position_", "rotation_")) and math.isnan(value))
     }
     values["closed"] = _rounded(gap.closed, 4)
     values["closed_interval"] = [_rounded(values.pop(name), 4) for name in ("closed_low", "closed_high")]

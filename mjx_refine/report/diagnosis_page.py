@@ -143,7 +143,7 @@ def _pictures(diagnosis: Diagnosis, observation: Observation | None, changed: bo
     """What the template needs of the two scenes' pictures; nothing where there is no clip or they cannot be simulated."""
     nothing: dict[str, Any] = {"frames": [], "plots": [], "lost": None, "filmed": True, "failed": ""}
     if observation is None:
-        return nothing
+        return {**nothing, "plots": _pose_plots(diagnosis, changed)}
     try:
         before = replay(diagnosis.base, observation, diagnosis.matching)
         after = replay(diagnosis.scene, observation, diagnosis.matching) if changed else before
@@ -162,6 +162,24 @@ def _pictures(diagnosis: Diagnosis, observation: Observation | None, changed: bo
         "filmed": observation.frames is not None,
         "failed": "",
     }
+
+
+def _pose_plots(diagnosis: Diagnosis, changed: bool) -> list[tuple[str, Markup]]:
+    """Errors of measured poses over time, one plot an object and kind of error."""
+    told = diagnosis.pose_errors
+    if told is None:
+        return []
+    curves = []
+    for n, name in enumerate(diagnosis.base.names):
+        for before, after, factor, words in (
+            (told.position, told.position_after, 1e3, "position error [mm]"),
+            (told.rotation, told.rotation_after, np.degrees(1.0), "rotation error [degrees]"),
+        ):
+            if np.isfinite(before[:, n]).any():
+                second = factor * after[:, n] if changed else None
+                svg = plots.error_plot(told.time, factor * before[:, n], second, words)
+                curves.append((f"{name}: {words.split(' [')[0]}", Markup(svg)))
+    return curves
 
 
 def _diverges(*replays: Replay) -> int | None:

@@ -41,6 +41,8 @@ class GapTile:
 def gap_tiles(gap: Gap, changed: bool) -> list[GapTile]:
     """The numbers at the top of the page; ``changed``: whether the diagnosed scene is another than the base model's."""
     floor = f"noise floor {number(gap.noise_floor, 3)}"
+    if math.isfinite(gap.position_before) or math.isfinite(gap.rotation_before):
+        return _pose_tiles(gap, changed, floor)
     if not changed:
         return [
             GapTile("Gap, base model", number(gap.before, 3), "", floor, True),
@@ -70,6 +72,23 @@ def gap_tiles(gap: Gap, changed: bool) -> list[GapTile]:
             not gap.epe_after > gap.epe_before,
         ),
     ]
+
+
+def _pose_tiles(gap: Gap, changed: bool, floor: str) -> list[GapTile]:
+    """The same where poses were measured: errors in millimetres and degrees instead of pictures' scores."""
+    interval = f"90 % interval {percent(gap.closed_low)} … {percent(gap.closed_high)}"
+    tiles = [GapTile("Gap closed", percent(gap.closed), "", interval, not gap.closed < 0)] if changed else []
+    was = f"before {number(gap.before, 3)}, {floor}" if changed else floor
+    name = "Gap" if changed else "Gap, base model"
+    tiles.append(GapTile(name, number(gap.after, 3), "", was, not gap.after > gap.before))
+    for kind, before, after, factor, unit in (
+        ("Position", gap.position_before, gap.position_after, 1e3, "mm"),
+        ("Rotation", gap.rotation_before, gap.rotation_after, math.degrees(1.0), "degrees"),
+    ):
+        if math.isfinite(before):
+            was = f"before {number(factor * before, 3)} {unit}" if changed else "base model"
+            tiles.append(GapTile(f"{kind} error", number(factor * after, 3), unit, was, not after > before))
+    return tiles
 
 
 @dataclasses.dataclass(frozen=True)

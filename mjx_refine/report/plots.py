@@ -63,6 +63,22 @@ def epe_plot(before: Float[np.ndarray, "intervals"], after: Float[np.ndarray, "i
         return _svg(figure, axes)
 
 
+def error_plot(
+    time: Float[np.ndarray, "times"],
+    before: Float[np.ndarray, "times"],
+    after: Float[np.ndarray, "times"] | None,
+    words: str,
+) -> str:
+    """Errors of measured poses over time [s]; ``words``: of the axis; ``after`` None: there is one scene alone."""
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _axes("time [s]", words)
+        axes.plot(time, before, color=BEFORE, label="base model")
+        if after is not None:
+            axes.plot(time, after, color=AFTER, label="diagnosed scene")
+        axes.set_ylim(bottom=0)
+        return _svg(figure, axes)
+
+
 def convergence_plot(history: tuple[Step, ...], start: float) -> str:
     """Fitness at the search's resolution against rollouts; ``start`` is the best sample's."""
     with matplotlib.rc_context(_STYLE):

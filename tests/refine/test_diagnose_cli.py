@@ -57,8 +57,7 @@ def asked(monkeypatch):
         return answer(scene)
 
     monkeypatch.setattr(package, "diagnose", diagnose, raising=False)
-    for name in ("diagnose_clips", "diagnose_poses"):
-        monkeypatch.delattr(package, name, raising=False)
+    monkeypatch.delattr(package, "diagnose_clips", raising=False)
     return calls
 
 
@@ -175,13 +174,17 @@ BAD = {
     "clip and poses": ([*CALL, "--poses", "flows.npz"], "--poses and --video: expected one of them"),
     "two scenes and poses": (
         [*CALL[:3], "--init", "scene.yaml", "--poses", "flows.npz", "--out", "out"],
-        "2 --init with --poses; expected one",
+        "2 --init and 1 --poses; expected one of each",
+    ),
+    "two scenes and two poses": (
+        [*CALL[:3], "--poses", "p.npz", "--init", "scene.yaml", "--poses", "p.npz", "--out", "out"],
+        "2 --init and 2 --poses; expected one of each; diagnose each recording by itself",
     ),
     "clips of the future": (
         [*CALL, "--init", "scene.yaml", "--video", "flows.npz"],
         "2 pairs of --init and --video: this version cannot diagnose that yet; diagnose each clip by itself",
     ),
-    "poses of the future": ([*CALL[:3], "--poses", "flows.npz", *CALL[5:]], "--poses: this version cannot"),
+    "a clip as poses": ([*CALL[:3], "--poses", "flows.npz", *CALL[5:]], "flows.npz: unknown key 'flow'"),
     "out is a file": ([*CALL[:-1], "scene.yaml"], "scene.yaml is no directory"),
     "out below a file": ([*CALL[:-1], "scene.yaml/out"], "scene.yaml is no directory"),
     "wrong seed": ([*CALL, "--seed", "-1"], "-1 is not in the range"),
@@ -267,8 +270,8 @@ def test_poses_reach_the_diagnosis(folder, asked, monkeypatch):
     np.savez(folder / "poses.npz", time=np.arange(3.0), pos=np.zeros((3, 3)), quat=np.tile([1.0, 0, 0, 0], (3, 1)))
     reached = []
 
-    def diagnose_poses(scene, path, **options):
-        reached.append((scene, path.name, options["seed"]))
+    def diagnose_poses(scene, poses, **options):
+        reached.append((scene, poses.source, options["seed"]))
         return answer(scene)
 
     monkeypatch.setattr(package, "diagnose_poses", diagnose_poses, raising=False)

@@ -68,7 +68,7 @@ def measured_poses(poses: Poses, columns: tuple[int, ...]) -> PosesMeasured:
         flow=np.full((count - 1, objects, 1, 2), np.nan),
         places=np.zeros((1, 2)),
         background=np.full((count - 1, 1, 2), np.nan),
-        present=np.isfinite(position).any(-1) | np.isfinite(reach).any(-1),
+        present=np.asarray(np.isfinite(position).any(-1) | np.isfinite(reach).any(-1)),
         edge_noise=rot[chosen],
         flow_noise=np.ones(objects),
         moment_noise=place[chosen],
@@ -207,9 +207,9 @@ class PosesFit(ClipFit):
                 width = UNSEEN_TURN * self.measured.edge_noise[n]
                 row[:, n] = np.where(np.isfinite(self.measured.reach[:, n]), width * matrix[:, n, :, axis], 0.0)
                 rows.append(row)
-        empty = [np.zeros((len(rows), *part.shape)) for part in self.measured.parts]
-        reach = np.array(rows) if rows else empty[0]
-        return Parts(reach, *empty[1:])
+        none = np.zeros((1, *self.measured.reach.shape))
+        reach = np.array(rows) if rows else none
+        return Parts(reach, *(np.zeros((len(reach), *part.shape)) for part in self.measured.parts[1:]))
 
     def distances(self, prediction: Prediction) -> Parts:
         """Simulated minus measured [rad], [m]; NaN where nothing was measured."""
