@@ -14,7 +14,7 @@ from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.poses.data import Poses, rotation_vector
 from mjx_refine.diagnosis.poses.fit import PosesFit
 from mjx_refine.scene import Body, Scene
-from mjx_refine.space import Space
+from mjx_refine.space import Parameter, Space
 
 BEGINNING = 0.08
 """Time from the first sample on that the start's position and velocity are taken from [s]."""
@@ -23,7 +23,11 @@ FEWEST, MOST = 4, 14
 """Samples that they are taken from, at least and at most."""
 
 METRIC = 0.25
-"""Widths of sizes and gravity against those of pictures, which do not tell metres."""
+"""Widths of sizes against those of pictures, which do not tell metres."""
+
+GRAVITY = (0.005, 0.02)
+"""Width and bound of gravity, as parts of the scene's: a tracker's scale errs by so much. Where metres and seconds are
+measured, a body that falls slower than that is held by something."""
 
 HORIZONS = (0.15, 0.3, 0.45, 0.6, 0.8)
 """Parts of the recording that are fitted one after the other: an early bounce must be right before what follows it."""
@@ -79,15 +83,21 @@ def _line(
 
 
 def poses_space(scene: Scene) -> Space:
-    """The parameters of the base model without the camera; sizes and gravity are known better than from pictures."""
+    """The parameters of the base model without the camera; sizes are known better than from pictures, and so is gravity."""
     space = base_space(scene)
     camera = np.array([p.field.startswith("camera") for p in space.parameters], bool)
     space = space.freeze(camera, space.start, "poses do not show the camera")
-    narrowed = tuple(
-        dataclasses.replace(p, width=METRIC * p.width) if p.field in ("size", "gravity") else p
-        for p in space.parameters
-    )
-    return dataclasses.replace(space, parameters=narrowed)
+    return dataclasses.replace(space, parameters=tuple(_metric(p) for p in space.parameters))
+
+
+def _metric(p: Parameter) -> Parameter:
+    if p.field == "size":
+        return dataclasses.replace(p, width=METRIC * p.width)
+    if p.field == "gravity":
+        width, part = GRAVITY
+        low, high = max(p.low, p.start * (1 - part)), min(p.high, p.start * (1 + part))
+        return dataclasses.replace(p, width=width, low=low, high=high)
+    return p
 
 
 def fit_base(clip: PosesFit, space: Space, seed: int) -> Fit:
