@@ -16,7 +16,7 @@ from mjx_refine.diagnosis import diagnose_poses, load_poses, make_poses
 from mjx_refine.diagnosis.poses.data import noise_of, rotation_vector
 from mjx_refine.diagnosis.poses.fit import PosesFit, at_times, rate_of
 from mjx_refine.diagnosis.poses.heldout import kept_samples
-from mjx_refine.diagnosis.poses.start import poses_space, started
+from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Body, Effect, Scene, load_scene, save_scene
 from mjx_refine.sim.c import MujocoSimulator
@@ -213,8 +213,6 @@ def test_a_perfect_simulation_at_uneven_times_leaves_nothing():
     poses = make_poses(chosen / 800, fine[chosen, 0, :3], fine[chosen, 0, 3:], sigma_pos=1e-3, sigma_rot=0.01)
     scene = started(GIVEN, poses, (0,))
     clip = PosesFit(MujocoSimulator(scene.shapes, rate_of(poses.time), 1), poses, (0,))
-    from mjx_refine.diagnosis.poses.start import fit_base
-
     fit = fit_base(clip, poses_space(scene), 0)
     assert clip.misfit(fit) < 0.5
     found = fit.hypothesis.scene(fit.z, clip.frames).objects[0]
@@ -228,8 +226,15 @@ def test_the_start_is_taken_from_the_first_samples():
     assert body.angular_velocity == pytest.approx(BALL.angular_velocity, abs=0.6)
 
 
-def test_the_space_has_no_camera():
-    assert not [name for name in poses_space(THROW).names if name.startswith("camera")]
+def test_the_space_has_no_camera_and_gravity_is_nearly_known():
+    space = poses_space(THROW)
+    assert not [name for name in space.names if name.startswith("camera")]
+    (gravity,) = (p for p in space.parameters if p.name == "gravity")
+    assert (gravity.low, gravity.start, gravity.high) == pytest.approx((9.6138, 9.81, 10.0062))
+
+
+def test_a_scene_without_gravity_has_none():
+    assert "gravity" not in poses_space(dataclasses.replace(THROW, gravity=(0.0, 0.0, 0.0))).names
 
 
 def test_held_out_blocks_last_a_tenth_of_a_second():
@@ -259,12 +264,12 @@ QUICK = ("offset_com", "hidden_obstacle", "friction_patch", "magnus")
 @pytest.mark.parametrize(
     ("scene", "name", "values"),
     [
-        (acting("drag", quadratic=0.01), "drag", {"quadratic": 0.01}),
+        (acting("drag", quadratic=0.02), "drag", {"quadratic": 0.02}),
         (acting("wind", None, x=3.0, y=-2.0), "wind", {"x": 3.0, "y": -2.0}),
     ],
 )
 def test_an_effect_is_named_and_measured(scene, name, values):
-    poses = recorded(scene, 60.0, 0.6)
+    poses = recorded(scene, 60.0, 0.5)
     found = diagnose_poses(GIVEN, poses, threads=1, without=QUICK)
     first = found.candidates[0]
     assert (found.verdict.effects, first.effect) == ((name,), name)
@@ -274,7 +279,7 @@ def test_an_effect_is_named_and_measured(scene, name, values):
     else:
         speed = 3.5
         force = sum(first.parameters[k].value * speed**p for k, p in (("linear", 1), ("quadratic", 2)))
-        assert force == pytest.approx(0.01 * speed**2, rel=0.15)
+        assert force == pytest.approx(0.02 * speed**2, rel=0.15)
     assert found.gap.closed > 0.7
     assert found.gap.position_after < found.gap.position_before
     assert found.where[0].phase == "flight"
