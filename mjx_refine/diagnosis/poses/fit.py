@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
-from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
+from mjx_refine.diagnosis.fit import SCALE, STEPS, ClipFit, Fit
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import BLUR, Counts, Noise
 from mjx_refine.diagnosis.poses.data import Poses, noise_of, rotation_vector
@@ -26,8 +26,9 @@ from mjx_refine.sim.backends import Simulator
 VIDEO = 30.0
 """Frames a second of the clips that the constants of impacts were chosen on."""
 
-LEAST_RATE, MOST_RATE = 30.0, 80.0
-"""Simulated frames a second: the measured rate, a multiple or a part of it that lies between."""
+LEAST_RATE, MOST_RATE = 30.0, 45.0
+"""Simulated frames a second: the measured rate, a multiple or a part of it between these where there is one. Eight steps a
+frame are then about a video's, and parabolas between frames are exact in flight."""
 
 PATIENCE = 6.0
 """Multiples of the robust loss's scale: a tracked pose is seldom wild, and a misfit of centimetres must be felt."""
@@ -210,6 +211,15 @@ class PosesFit(ClipFit):
         none = np.zeros((1, *self.measured.reach.shape))
         reach = np.array(rows) if rows else none
         return Parts(reach, *(np.zeros((len(reach), *part.shape)) for part in self.measured.parts[1:]))
+
+    def jacobian(self, hypothesis, z, base, keep=None, scale=SCALE, size=STEPS[0]):
+        """As ``ClipFit.jacobian``, in one rollout, since every parameter moves something."""
+        low, high = hypothesis.bounds
+        step = np.where(z + size > high, -size, size)
+        points = np.clip(z + np.diag(step), low, high)
+        prediction = self.predictor(self.poses(hypothesis, points), hypothesis.batch(points))
+        white = self.whitened(self.distances(prediction), keep, scale)
+        return (np.where(prediction.bad[:, None], 0.0, white - base) / step[:, None]).T
 
     def distances(self, prediction: Prediction) -> Parts:
         """Simulated minus measured [rad], [m]; NaN where nothing was measured."""
