@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +15,12 @@ from mjx_refine import rotations
 from mjx_refine.cli.main import run
 from mjx_refine.diagnosis import diagnose_poses, load_poses, make_poses
 from mjx_refine.diagnosis.poses.data import noise_of, rotation_vector
+from mjx_refine.diagnosis.poses.diagnose import unsettled
 from mjx_refine.diagnosis.poses.fit import PosesFit, at_times, rate_of
 from mjx_refine.diagnosis.poses.heldout import kept_samples
 from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
+from mjx_refine.diagnosis.search import Candidate, Compared
+from mjx_refine.diagnosis.verdict import Signs
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Body, Effect, Scene, load_scene, save_scene
 from mjx_refine.sim.c import MujocoSimulator
@@ -243,6 +247,17 @@ def test_held_out_blocks_last_a_tenth_of_a_second():
     assert ((lengths >= 14) & (lengths <= 30)).all()
     assert 0.6 < keep.mean() < 0.75
     assert kept_samples(np.arange(9) / 15.0).tolist() == [True] * 6 + [False] * 3
+
+
+def test_leads_do_not_grow_where_the_noise_is_overstated():
+    fit = SimpleNamespace(evidence=0.0)
+    compared = Compared(fit, (Candidate(fit, 20.0, 0.0),), (), 0)
+    told = Signs(20.0 / 0.3, 10.0 / 0.3, 0.0, 0.1, 0.1, 1.0, 1.0, 3.0 / 0.3, 1.0)
+    plain = unsettled(told, compared)
+    assert (plain.lead, plain.margin, plain.held_out) == pytest.approx((20.0, 10.0, 3.0))
+    assert unsettled(plain, compared) == plain
+    assert unsettled(dataclasses.replace(told, lead=5.0), compared).lead == 5.0
+    assert unsettled(told, Compared(fit, (), (), 0)) == told
 
 
 # --- from end to end --------------------------------------------------------------------------------------------------

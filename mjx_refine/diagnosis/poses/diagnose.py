@@ -77,7 +77,7 @@ def diagnose_poses(
     told("held-out samples")
     best = best_candidate(compared)
     outside = held_out(clip, compared.base, best.fit if best else None)
-    found = signs(clip, compared, outside[0].gain)
+    found = unsettled(signs(clip, compared, outside[0].gain), compared)
     said = answer(found, [c.lead for c in compared.candidates])
     told("report")
     return _result(clip, compared, outside, found, said, blank, columns, seed, began)
@@ -144,6 +144,24 @@ def _turned(clip: PosesFit) -> np.ndarray:
         if seen.any():
             result[seen, n] = np.abs(quaternion[seen, n] @ quaternion[seen, n][0])
     return result
+
+
+def unsettled(found: Signs, compared: Compared) -> Signs:
+    """The signs with leads in nats where a fit leaves less than the noise.
+
+    A video's noise is read off its residuals; that of poses is stated, or cautious, and a lead must not count more because
+    of it.
+    """
+    if not compared.candidates or found.lead <= compared.candidates[0].lead:
+        return found
+    unit = compared.candidates[0].lead / found.lead
+    return dataclasses.replace(
+        found,
+        lead=unit * found.lead,
+        margin=unit * found.margin,
+        pair=unit * found.pair,
+        held_out=unit * found.held_out,
+    )
 
 
 # --- the answer -------------------------------------------------------------------------------------------------------
