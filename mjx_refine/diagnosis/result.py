@@ -133,6 +133,7 @@ class PoseErrors:
       rotation: ditto [rad].
       position_after: of the diagnosed scene [m].
       rotation_after: ditto [rad].
+      plain: root mean square errors [m], [rad] of the base model's fit in which contacts may not err.
     """
 
     time: Float[np.ndarray, "times"]
@@ -140,6 +141,7 @@ class PoseErrors:
     rotation: Float[np.ndarray, "times objects"]
     position_after: Float[np.ndarray, "times objects"]
     rotation_after: Float[np.ndarray, "times objects"]
+    plain: tuple[float, float] = (math.nan, math.nan)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,6 +30,9 @@ MOST = 8
 """Impacts an object that are looked at, strongest first."""
 
 
+FELT = 0.2
+"""Error in noise widths below which nobody would see it."""
+
 PHASES, SHORTEST = 3, 6
 """Into how many parts a time on the floor is cut, and how many frames it must last."""
 
@@ -78,7 +81,8 @@ class Slack:
 def slack_of(columns: Float[np.ndarray, "residuals columns"]) -> Slack:
     """From the columns C, one standard deviation each."""
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
-    return Slack(basis, 1.0 - 1.0 / np.sqrt(1.0 + size**2))
+    felt = size > FELT
+    return Slack(np.ascontiguousarray(basis[:, felt]), 1.0 - 1.0 / np.sqrt(1.0 + size[felt] ** 2))
 
 
 def impacts(batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], fps: float) -> list[Impact]:

@@ -14,7 +14,7 @@ from mjx_refine.diagnosis.fit import Fit
 from mjx_refine.diagnosis.heldout import HeldOut
 from mjx_refine.diagnosis.poses.data import Poses
 from mjx_refine.diagnosis.poses.fit import PosesFit, rate_of
-from mjx_refine.diagnosis.poses.heldout import Errors, errors_of, held_out
+from mjx_refine.diagnosis.poses.heldout import Errors, errors_of, held_out, total
 from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.diagnosis.poses.where import describe, misfit_map, seen_frames
 from mjx_refine.diagnosis.result import Diagnosis, Gap, PoseErrors
@@ -73,14 +73,32 @@ def diagnose_poses(
     left_out = (*without, *(name for name, kind in catalogue().items() if not kind.physical))
     blank = Observation(np.zeros((clip.frames - 1, 8, 8, 2), np.float32), None, clip.simulator.fps)
     space = poses_space(scene)
-    compared = compare(clip, scene, blank, columns, left_out, seed, told, begin=lambda: fit_base(clip, space, seed))
+    first: list[Errors] = []
+
+    def begin() -> Fit:
+        fit = fit_base(clip, space, seed)
+        first.append(total(clip, fit))
+        return fit
+
+    compared = compare(clip, scene, blank, columns, left_out, seed, told, begin=begin)
     told("held-out samples")
     best = best_candidate(compared)
     outside = held_out(clip, compared.base, best.fit if best else None)
     found = unsettled(signs(clip, compared, outside[0].gain), compared)
     said = answer(found, [c.lead for c in compared.candidates])
     told("report")
-    return _result(clip, compared, outside, found, said, blank, columns, seed, began)
+    diagnosis = _result(clip, compared, outside, found, said, blank, columns, seed, began)
+    return _with_plain(diagnosis, first[0], compared.impacts)
+
+
+def _with_plain(diagnosis: Diagnosis, plain: Errors, impacts: int) -> Diagnosis:
+    """With what the base model's first fit left, in which contacts were not allowed to err."""
+    told = diagnosis.pose_errors
+    if told is None or not impacts:
+        return diagnosis
+    note = f"The base model's fit in which they may not err is off by {_words(plain)} over all samples."
+    errors = dataclasses.replace(told, plain=(plain.position, plain.rotation))
+    return dataclasses.replace(diagnosis, notes=(*diagnosis.notes, note), pose_errors=errors)
 
 
 def _columns(scene: Scene, poses: Poses) -> tuple[int, ...]:

@@ -17,7 +17,7 @@ BINS = 1.0 / VIDEO
 
 @dataclasses.dataclass(frozen=True)
 class Errors:
-    """Root mean square errors on held-out samples, over all measured objects.
+    """Root mean square errors over all measured objects.
 
     Attributes:
       position: [m]; NaN where none was measured.
@@ -83,6 +83,11 @@ def errors_of(clip: PosesFit, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
         length = np.sqrt(np.nansum(shift**2, -1))
         results.append(np.where(np.isfinite(shift).any(-1), length, np.nan))
     return results[0], results[1]
+
+
+def total(clip: PosesFit, fit: Fit) -> Errors:
+    """Root mean square errors over all samples."""
+    return Errors(*(_root(values) for values in errors_of(clip, fit)))
 
 
 def _root(values: np.ndarray) -> float:

@@ -15,6 +15,9 @@ from mjx_refine.effects.kind import FitView
 QUIET = 0.3
 """Mean excess of the squared misfit [noise widths squared] below which nothing is said of it."""
 
+MUCH = 3.0
+"""Noise widths from which errors that impacts excuse are told."""
+
 STEADY = 0.5
 """Part of the misfit that its mean must be for its direction to be named."""
 
@@ -53,7 +56,7 @@ def describe(clip: PosesFit, fit: Fit, view: FitView) -> str:
     energy, channel, _ = misfit_map(clip, fit)
     excess = np.maximum(energy - 1.0, 0.0)
     if excess.sum() < QUIET * max(seen_frames(clip).sum(), 1):
-        return "Nothing above the measurement's noise."
+        return _quiet(clip, fit)
     names = fit.hypothesis.space.scene.names
     n = int(excess.sum(1).argmax())
     frames = np.nonzero(excess[n] > 0.5)[0]
@@ -73,6 +76,22 @@ def describe(clip: PosesFit, fit: Fit, view: FitView) -> str:
             words.append(f"the misfit {'grows' if link > 0 else 'shrinks'} with its speed")
     words.append(f"mostly {CHANNELS[int(np.bincount(channel[n, frames]).argmax())]}, {phase_of(view, n, first, last)}")
     return "; ".join(words) + "."
+
+
+def _quiet(clip: PosesFit, fit: Fit) -> str:
+    """Where nothing is above the noise and what impacts may err: how much that was."""
+    moved, turned = shifts_of(clip, fit)
+    widths = clip.measured.moment_noise, clip.measured.edge_noise[:, None]
+    for n, name in enumerate(fit.hypothesis.space.scene.names):
+        for shift, width in ((moved, widths[0]), (turned, widths[1])):
+            seen = shift[np.isfinite(shift[:, n]).any(-1), n] / width[n]
+            if len(seen) and np.sqrt(np.nanmean(seen**2)) > MUCH:
+                size = _size(moved[:, n], turned[:, n], np.ones(len(moved), bool))
+                return (
+                    f"Nothing above the measurement's noise and what impacts may err, which here is much: {name} is off by "
+                    f"{size} (root mean square)."
+                )
+    return "Nothing above the measurement's noise."
 
 
 def _size(moved: np.ndarray, turned: np.ndarray, during: np.ndarray) -> str:
