@@ -1,7 +1,7 @@
 """Diagnosis of recorded poses: cube tosses (ContactNets) and ball drops (de Silva et al.); prints the README's tables.
 
     python -m benchmarks.real_poses tosses FOLDER [--count 10] [--out runs/tosses]
-    python -m benchmarks.real_poses drops FOLDER [--out runs/drops]
+    python -m benchmarks.real_poses drops FOLDER [--count 11] [--out runs/drops]
 
 FOLDER holds ``toss_NNN.npz`` (Pfrommer, Halm, Posa, CoRL 2020, arXiv:2009.11193; BSD-3-Clause) or ``ball_drops.csv`` and
 ``balls.txt`` (de Silva et al., Front. Artif. Intell. 3:25, 2020; MIT). Nothing of them is kept here.
@@ -27,7 +27,7 @@ CAMERA = Camera((0.0, -3.0, 1.5), 65.0)
 EDGE, CUBE_MASS = 0.1048, 0.37
 """Published cube [m], [kg]."""
 
-TRACKING = {"sigma_pos": 1e-3, "sigma_rot": 0.01}
+SIGMA_POS, SIGMA_ROT = 1e-3, 0.01
 """Noise stated for the tosses [m], [rad]. Their third differences say 0.02 mm, because the published poses are smoothed; but
 at rest the cube's centre lies 1.4 mm below half of the published edge."""
 
@@ -64,7 +64,9 @@ GUESSED = {"volleyball": (9.5, 66.0)}
 def toss(path: Path) -> Poses:
     """One recorded toss."""
     with np.load(path, allow_pickle=False) as file:
-        return make_poses(file["time"], file["pos"], file["quat"], source=path.name, **TRACKING)
+        return make_poses(
+            file["time"], file["pos"], file["quat"], source=path.name, sigma_pos=SIGMA_POS, sigma_rot=SIGMA_ROT
+        )
 
 
 def cube() -> Scene:
@@ -76,7 +78,7 @@ def cube() -> Scene:
     return Scene((body,), CAMERA, (0.0, 0.0, -9.81))
 
 
-def tosses(folder: Path, count: int, out: Path, seed: int) -> None:
+def tosses(folder: Path, count: int | None, out: Path, seed: int) -> None:
     """Prints a row a toss."""
     print(
         "| toss | verdict | first candidate | lead | gap before | after | closed | mm before | after | ° before | after | s |"
@@ -87,7 +89,9 @@ def tosses(folder: Path, count: int, out: Path, seed: int) -> None:
         told = diagnose_poses(cube(), toss(path), seed=seed)
         write_diagnosis(out / path.stem, told, None, {"poses": path.name, "seed": seed})
         found.append(told)
-        print(f"| {path.stem[5:]} | {_common(told)} | {told.seconds:.0f} |", flush=True)
+        plain = told.pose_errors.plain if told.pose_errors else (math.nan, math.nan)
+        left = f"{1e3 * plain[0]:.1f} | {math.degrees(plain[1]):.2f}"
+        print(f"| {path.stem[5:]} | {_common(told)} | {left} | {told.seconds:.0f} |", flush=True)
     gaps = np.array([[d.gap.before, d.gap.after, d.gap.closed] for d in found])
     middle = np.median(gaps, 0)
     print(f"\nmedians: gap {middle[0]:.2f} -> {middle[1]:.2f} noise widths, closed {middle[2]:.2f}")
@@ -135,8 +139,8 @@ def falling(track: np.ndarray, name: str) -> Poses:
     return make_poses(time[used], position, np.full((used.sum(), 4), np.nan), source=name)
 
 
-def drops(folder: Path, out: Path, seed: int) -> None:
-    """Prints a row a drop."""
+def drops(folder: Path, count: int | None, out: Path, seed: int) -> None:
+    """Prints a row a drop, each ball's first before its second."""
     sizes = balls(folder)
     print(
         "| ball, drop | kg | m | verdict | first candidate | lead | gap before | after | closed | mm before | after | "
@@ -144,7 +148,7 @@ def drops(folder: Path, out: Path, seed: int) -> None:
     )
     print("| --- " * 14 + "|", flush=True)
     pairs = []
-    for (ball, drop), track in sorted(heights(folder).items(), key=lambda item: item[0][1]):
+    for (ball, drop), track in sorted(heights(folder).items(), key=lambda item: item[0][1])[:count]:
         mass, radius = sizes[KEYS[ball]]
         body = Body("sphere", "ball", (radius,), (0.0, 0.0, 40.0), mass=mass)
         told = diagnose_poses(Scene((body,), CAMERA, (0.0, 0.0, -9.81)), falling(track, f"{ball} {drop}"), seed=seed)
@@ -182,7 +186,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("tosses", "drops"))
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--count", type=int, default=10)
+    parser.add_argument("--count", type=int, help="so many recordings; all by default")
     parser.add_argument("--out", type=Path, default=Path("runs/real_poses"))
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -190,7 +194,7 @@ def main() -> None:
     if arguments.what == "tosses":
         tosses(arguments.folder, arguments.count, arguments.out, arguments.seed)
     else:
-        drops(arguments.folder, arguments.out, arguments.seed)
+        drops(arguments.folder, arguments.count, arguments.out, arguments.seed)
 
 
 if __name__ == "__main__":
