@@ -14,11 +14,13 @@ from own_poses import BALL, CAMERA, GIVEN, SIGMA, THROW, acting, exact, recorded
 from mjx_refine import rotations
 from mjx_refine.cli.main import run
 from mjx_refine.diagnosis import diagnose_poses, load_poses, make_poses
+from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.poses.data import noise_of, rotation_vector
 from mjx_refine.diagnosis.poses.diagnose import unsettled
 from mjx_refine.diagnosis.poses.fit import PosesFit, at_times, rate_of
 from mjx_refine.diagnosis.poses.heldout import kept_samples
 from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
+from mjx_refine.diagnosis.poses.where import quiet
 from mjx_refine.diagnosis.search import Candidate, Compared
 from mjx_refine.diagnosis.verdict import Signs
 from mjx_refine.errors import InputError
@@ -221,6 +223,15 @@ def test_a_perfect_simulation_at_uneven_times_leaves_nothing():
     assert clip.misfit(fit) < 0.5
     found = fit.hypothesis.scene(fit.z, clip.frames).objects[0]
     assert found.linear_velocity == pytest.approx((3.0, 0.3, 2.5), abs=0.02)
+
+
+def test_what_impacts_excuse_is_told_all_the_same():
+    poses = recorded(THROW, span=0.4)
+    scene = started(GIVEN, poses, (0,))
+    clip = PosesFit(MujocoSimulator(scene.shapes, rate_of(poses.time), 1), poses, (0,))
+    far = dataclasses.replace(scene, objects=(dataclasses.replace(scene.objects[0], position=(-0.9, 0.4, 1.0)),))
+    fit = clip.at(Hypothesis(poses_space(far)), np.zeros(poses_space(far).dimension))
+    assert "what impacts may err, which here is much: ball is off by 1" in quiet(clip, fit)
 
 
 def test_the_start_is_taken_from_the_first_samples():

@@ -56,7 +56,7 @@ def describe(clip: PosesFit, fit: Fit, view: FitView) -> str:
     energy, channel, _ = misfit_map(clip, fit)
     excess = np.maximum(energy - 1.0, 0.0)
     if excess.sum() < QUIET * max(seen_frames(clip).sum(), 1):
-        return _quiet(clip, fit)
+        return quiet(clip, fit)
     names = fit.hypothesis.space.scene.names
     n = int(excess.sum(1).argmax())
     frames = np.nonzero(excess[n] > 0.5)[0]
@@ -78,7 +78,7 @@ def describe(clip: PosesFit, fit: Fit, view: FitView) -> str:
     return "; ".join(words) + "."
 
 
-def _quiet(clip: PosesFit, fit: Fit) -> str:
+def quiet(clip: PosesFit, fit: Fit) -> str:
     """Where nothing is above the noise and what impacts may err: how much that was."""
     moved, turned = shifts_of(clip, fit)
     widths = clip.measured.moment_noise, clip.measured.edge_noise[:, None]
