@@ -143,10 +143,10 @@ def drops(folder: Path, count: int | None, out: Path, seed: int) -> None:
     """Prints a row a drop, each ball's first before its second."""
     sizes = balls(folder)
     print(
-        "| ball, drop | kg | m | verdict | first candidate | lead | gap before | after | closed | mm before | after | "
-        "deceleration at 20 m/s: fitted m/s² (90 %) | reference | s |"
+        "| ball, drop | kg | m | verdict | drag's lead | best other | its lead | gap before | with drag | closed by it | "
+        "deceleration at 20 m/s, m/s² | reference | s |"
     )
-    print("| --- " * 14 + "|", flush=True)
+    print("| --- " * 13 + "|", flush=True)
     pairs = []
     for (ball, drop), track in sorted(heights(folder).items(), key=lambda item: item[0][1])[:count]:
         mass, radius = sizes[KEYS[ball]]
@@ -154,12 +154,12 @@ def drops(folder: Path, count: int | None, out: Path, seed: int) -> None:
         told = diagnose_poses(Scene((body,), CAMERA, (0.0, 0.0, -9.81)), falling(track, f"{ball} {drop}"), seed=seed)
         write_diagnosis(out / f"{KEYS[ball]}-{drop}", told, None, {"poses": f"{ball}, drop {drop}", "seed": seed})
         reference = 0.5 * RHO * DRAG_COEFFICIENT * math.pi * radius**2 * 400 / mass
-        fitted, text = _deceleration(told, mass)
+        fitted, row = _of_drag(told, mass)
         if math.isfinite(fitted):
             pairs.append((reference, fitted))
-        row = " | ".join(_common(told).split(" | ")[:8])
         print(
-            f"| {ball}, {drop} | {mass:.3f} | {radius:.3f} | {row} | {text} | {reference:.2f} | {told.seconds:.0f} |",
+            f"| {ball}, {drop} | {mass:.3f} | {radius:.3f} | {' + '.join(told.verdict.effects) or 'none'} "
+            f"{told.verdict.probability:.2f} | {row} | {reference:.2f} | {told.seconds:.0f} |",
             flush=True,
         )
     order = np.argsort(np.argsort(np.array(pairs), 0), 0).T
@@ -168,17 +168,18 @@ def drops(folder: Path, count: int | None, out: Path, seed: int) -> None:
     )
 
 
-def _deceleration(told: Diagnosis, mass: float, speed: float = 20.0) -> tuple[float, str]:
-    """What drag, if it was fitted at all, does at ``speed`` [m/s^2]."""
-    for one in told.candidates:
-        if one.effect == "drag":
-            k = one.parameters
-            value, low, high = (
-                (getattr(k["linear"], end) * speed + getattr(k["quadratic"], end) * speed**2) / mass
-                for end in ("value", "low", "high")
-            )
-            return value, f"{value:.2f} ({low:.2f}–{high:.2f})"
-    return math.nan, "–"
+def _of_drag(told: Diagnosis, mass: float, speed: float = 20.0) -> tuple[float, str]:
+    """What drag, if it was fitted at all, does at ``speed`` [m/s^2], and cells of the table."""
+    drag = next((c for c in told.candidates if c.effect == "drag"), None)
+    others = sorted((c for c in told.candidates if c.effect != "drag"), key=lambda c: -c.evidence)
+    rival = f"{others[0].effect} | {others[0].evidence:.0f}" if others else "– | –"
+    if drag is None:
+        return math.nan, f"– | {rival} | {told.gap.before:.2f} | – | – | –"
+    k = drag.parameters
+    value = (k["linear"].value * speed + k["quadratic"].value * speed**2) / mass
+    return value, (
+        f"{drag.evidence:.0f} | {rival} | {told.gap.before:.2f} | {drag.gap_after:.2f} | {drag.closed:.2f} | {value:.2f}"
+    )
 
 
 def main() -> None:

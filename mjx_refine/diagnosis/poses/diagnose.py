@@ -264,15 +264,7 @@ def _notes(
     names: tuple[str, ...],
     columns: tuple[int, ...],
 ) -> tuple[str, ...]:
-    m = clip.measured
-    place = ", ".join(f"{1e3 * v:.2g}" for v in m.moment_noise.mean(1))
-    turn = ", ".join(f"{np.degrees(v):.2g}" for v in m.edge_noise)
-    told = "as stated" if m.stated else "from third differences in time; of smoothed poses that is too little"
-    notes = [
-        UNCALIBRATED,
-        f"A frame is {1e3 / clip.simulator.fps:.4g} ms of simulation. Noise of positions {place} mm ({told}), of rotations "
-        f"{turn} degrees.",
-    ]
+    notes = [UNCALIBRATED, _noise_words(clip)]
     if best is not None:
         notes.append(f"On held-out samples the error goes from {_words(outside[1])} to {_words(outside[2])}.")
     else:
@@ -285,6 +277,16 @@ def _notes(
             f"{compared.impacts} impacts may each err by 8 % of their change of velocity before anything else is blamed."
         )
     return tuple(notes)
+
+
+def _noise_words(clip: PosesFit) -> str:
+    m = clip.measured
+    source = "as stated" if m.stated else "from third differences in time; of smoothed poses that is too little"
+    moved = m.moment_noise[np.isfinite(m.moments).any(0)]
+    turned = m.edge_noise[np.isfinite(m.reach).any((0, 2))]
+    parts = [f"positions {1e3 * np.median(moved):.2g} mm ({source})"] if moved.size else []
+    parts += [f"rotations {np.degrees(np.median(turned)):.2g} degrees"] if turned.size else []
+    return f"A frame is {1e3 / clip.simulator.fps:.4g} ms of simulation. Noise of {', of '.join(parts)}."
 
 
 def _words(errors: Errors) -> str:

@@ -81,7 +81,7 @@ def measured_poses(poses: Poses, columns: tuple[int, ...]) -> PosesMeasured:
 def rate_of(time: Float[np.ndarray, "times"]) -> float:
     """Simulated frames a second: one a median time step, or a multiple or part within ``LEAST_RATE, MOST_RATE``."""
     rate = 1.0 / float(np.median(np.diff(time)))
-    return rate * np.ceil(LEAST_RATE / rate) if rate < LEAST_RATE else rate / np.ceil(rate / MOST_RATE - 1e-3)
+    return rate * np.ceil(LEAST_RATE / rate - 0.02) if rate < LEAST_RATE else rate / np.ceil(rate / MOST_RATE - 1e-3)
 
 
 def at_times(
