@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_refine import rotations
-from mjx_refine.effects import batch_with_effects
+from mjx_refine.effects import acting, batch_with_effects
 from mjx_refine.scene import Body, Camera, Effect, Scene
 from mjx_refine.sim.c import MujocoSimulator
 
@@ -212,3 +212,20 @@ def test_the_same_again_and_row_by_row():
     np.testing.assert_array_equal(one, other)
     alone = MujocoSimulator(batch.shapes, FPS, 1).rollout(batch[1:2], 20)
     np.testing.assert_allclose(alone[0], one[1], atol=1e-12)
+
+
+IDLING = (
+    effect("push", "ball", time=0.31, x=1.0, z=0.5),
+    effect("hidden_obstacle", "ball", angle=180.0, distance=-0.9, restitution=0.6),
+    effect("friction_patch", x=0.5, y=0.0, radius=0.3, friction=0.05),
+)
+
+
+@pytest.mark.parametrize("entry", IDLING, ids=lambda e: e.effect)
+def test_steps_taken_together_end_where_single_ones_do(entry, monkeypatch):
+    ball = dataclasses.replace(BALL, position=(0.0, 0.0, 0.2))
+    state = {"gravity": GRAVITY, "body": ball, "linear_velocity": (1.6, 0.0, 0.0), "angular_velocity": (0.0, 2.0, 0.0)}
+    together = rolled_out(entry, **state)
+    monkeypatch.setattr(acting, "idle", lambda batch, motion: 0.0)
+    np.testing.assert_allclose(together, rolled_out(entry, **state), atol=1e-4)
+    assert np.abs(together - rolled_out(**state)).max() > 0.05

@@ -1,0 +1,162 @@
+"""Centroids and areas of whole masks as evidence: with effects, in landings, in a diagnosis' noise."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from own_clip import FLIGHT, OwnClip, perturbed
+
+from mjx_refine.diagnosis.measure import Parts, measure
+from mjx_refine.diagnosis.noise import Counts, everywhere, settled
+from mjx_refine.diagnosis.slack import slack_of, sustained, touching
+from mjx_refine.effects import batch_with_effects
+from mjx_refine.observation import Observation
+from mjx_refine.scene import Body, Camera, Effect, Scene
+from mjx_refine.search.landing import Stage
+from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.view.effects import draw_effects
+from mjx_refine.view.moments import whole_masks
+from mjx_refine.view.seen import polygon_sums, seen_moments
+
+FPS = 30.0
+SIZE = (480, 320)
+SCENE = Scene(
+    (
+        Body("sphere", "ball", (0.25,), (-0.6, 0.3, 0.8), (1.0, 0.0, 0.0, 0.0), (2.5, 0.0, 1.0), (0.0, 3.0, 0.0)),
+        Body("box", "crate", (0.3, 0.2, 0.2), (0.7, 0.2, 0.2), linear_velocity=(-2.0, 0.5, 0.0)),
+    ),
+    Camera((0.2, -3.0, 2.0), 60.0, 45.0),
+)
+
+
+def effect(name: str, target: str | None = None, **parameters) -> Effect:
+    return Effect(name, target, tuple((k, float(v)) for k, v in parameters.items()))
+
+
+SEEN = (
+    effect("camera_motion", pan=20.0, x=0.4),
+    effect("lens_distortion", k1=0.25),
+    effect("rolling_shutter", readout=0.015),
+    effect("mask_bias", width=3.0),
+    effect("occluder", left=170.0, top=60.0, right=200.0, bottom=200.0),
+)
+
+
+@pytest.mark.parametrize("entry", SEEN, ids=lambda e: e.effect)
+def test_centroids_and_areas_are_those_of_the_pictures(entry):
+    batch = batch_with_effects([dataclasses.replace(SCENE, effects=(entry,))])
+    poses = MujocoSimulator(batch.shapes, FPS, 1).rollout(batch, 4)
+    masks, _ = draw_effects(poses[0], batch, SIZE, FPS)
+    told, drawn = seen_moments(poses, batch, SIZE, FPS)[0], whole_masks(masks, (1, 2))
+    assert np.isfinite(drawn[:3]).all()
+    off = np.abs(told - drawn)[:3]
+    assert off[..., :2].max() < 0.3
+    assert off[..., 2].max() < 0.3
+
+
+def test_an_occluder_moves_what_is_left_of_a_mask():
+    plain = batch_with_effects([SCENE])
+    poses = MujocoSimulator(plain.shapes, FPS, 1).rollout(plain, 2)
+    whole = seen_moments(poses, plain, SIZE, FPS)[0, 0, 0]
+    half = effect("occluder", left=whole[0], top=0, right=480, bottom=320)
+    hidden = batch_with_effects([dataclasses.replace(SCENE, effects=(half,))])
+    left = seen_moments(poses, hidden, SIZE, FPS)[0, 0, 0]
+    # The centroid of a half disc lies 4 r / (3 pi) beside its diameter; the polygon has sixteen corners.
+    np.testing.assert_allclose(left[2], whole[2] / np.sqrt(2), rtol=0.01)
+    np.testing.assert_allclose(whole[0] - left[0], 4 * whole[2] / (3 * np.pi), rtol=0.05)
+    everything = effect("occluder", left=0, top=0, right=480, bottom=320)
+    gone = batch_with_effects([dataclasses.replace(SCENE, effects=(everything,))])
+    assert np.isnan(seen_moments(poses, gone, SIZE, FPS)).all()
+
+
+def test_sums_of_a_rectangle():
+    corners = np.array([[1.0, 2.0], [4.0, 2.0], [4.0, 7.0], [1.0, 7.0]])
+    np.testing.assert_allclose(polygon_sums(corners), [15.0, 15.0 * 2.5, 15.0 * 4.5])
+
+
+# Landings ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_landing_ends_nearer_with_centroids():
+    clip = OwnClip(FLIGHT, 12)
+    start = perturbed(FLIGHT, 3, 0.05)
+    truth = clip.squares(FLIGHT).space.start
+    off = []
+    for whole in (None, whole_masks(clip.masks, clip.seen.ids)):
+        squares = clip.squares(start, whole=whole)
+        point = squares.run(squares.space.start, [Stage(12, 2.0, 8)]).point
+        poses = [clip.rollout(squares.space.decode(p[None]), 12)[0] for p in (point, truth)]
+        batch = squares.space.decode(point[None])
+        told = seen_moments(np.stack(poses), batch.map(lambda a: np.repeat(a, 2, 0)), (320, 214), 30.0)
+        off.append(float(np.abs(told[0] - whole_masks(clip.masks, clip.seen.ids))[..., :2].mean()))
+    assert off[1] < off[0]
+    assert off[1] < 0.1
+
+
+# Noise ------------------------------------------------------------------------------------------------------------------
+
+
+def _measured():
+    clip = OwnClip(FLIGHT, 12)
+    return measure(Observation(clip.flow, clip.masks, 30.0), (0,))
+
+
+def test_parts_come_back_from_a_row():
+    measured = _measured()
+    parts = Parts(*(np.random.default_rng(0).normal(size=(1, *p.shape)) for p in measured.parts))
+    for part, back in zip(parts, measured.split(parts.flat()[0]), strict=True):
+        np.testing.assert_array_equal(part[0], back)
+
+
+@pytest.mark.parametrize("size", [0.8, 2.0])
+def test_noise_settles_at_what_changes_from_frame_to_frame(size):
+    measured, counts, rng = _measured(), Counts(), np.random.default_rng(1)
+    noise, weight = everywhere(measured, 12), counts.of(measured.parts)
+    smooth = 5.0 * np.linspace(0, 1, 12)[:, None, None] ** 2
+    residual = Parts(
+        *(
+            np.sqrt(count) * size * rng.normal(size=part.shape)
+            for part, count in zip(measured.parts, weight, strict=True)
+        )
+    )
+    residual = residual._replace(moments=residual.moments + smooth)
+    told, _ = settled(measured, residual, counts)
+    np.testing.assert_allclose(told.moment_noise / noise.moments[0], size, rtol=0.5)
+
+
+def test_masks_that_stand_still_say_little():
+    clip = OwnClip(FLIGHT, 12)
+    still = Observation(np.zeros_like(clip.flow), np.repeat(clip.masks[:1], 12, 0), 30.0)
+    assert measure(still, (0,)).freshness.max() <= 0.1
+    assert measure(Observation(clip.flow, clip.masks, 30.0), (0,)).freshness.min() == 1.0
+
+
+# Slack ------------------------------------------------------------------------------------------------------------------
+
+
+def test_slack_forgives_its_own_columns_and_nothing_else():
+    rng = np.random.default_rng(2)
+    column, other = rng.normal(size=(2, 60))
+    other -= column * (column @ other) / (column @ column)
+    slack = slack_of(30.0 * column[:, None] / np.linalg.norm(column))
+    forgiven, kept = slack(np.stack([column, other]))
+    assert np.linalg.norm(forgiven) < 0.05 * np.linalg.norm(column)
+    np.testing.assert_allclose(kept, other, atol=1e-9)
+    nothing = slack_of(0.1 * column[:, None] / np.linalg.norm(column))
+    np.testing.assert_array_equal(nothing(column[None])[0], column)
+
+
+def test_times_on_the_floor_may_err():
+    slide = Scene(
+        (Body("box", "crate", (0.3, 0.2, 0.2), (0.0, 0.0, 0.2), linear_velocity=(2.0, 0.0, 0.0)),), SCENE.camera
+    )
+    flight = dataclasses.replace(slide, objects=(dataclasses.replace(slide.objects[0], position=(0.0, 0.0, 9.0)),))
+    found = []
+    for scene in (slide, flight):
+        batch = batch_with_effects([scene])
+        poses = MujocoSimulator(batch.shapes, FPS, 1).rollout(batch, 20)[0]
+        found.append(sustained(batch, poses, touching(batch, poses), FPS))
+    assert [i.target for i in found[0]] == [0, 0, 0]
+    assert found[1] == []
