@@ -98,9 +98,9 @@ def _check_motion(reach: np.ndarray, observation: Observation) -> None:
         raise InputError(
             f"{observation.source}: cannot tell: no object has a mask that can be measured; check the masks"
         )
-    with np.errstate(all="ignore"):
-        spans = np.nanmax(reach, 0) - np.nanmin(reach, 0)
-    if not float(np.nanmax(spans)) > LEAST_MOTION:
+    seen = np.isfinite(reach)
+    spans = np.where(seen, reach, -np.inf).max(0) - np.where(seen, reach, np.inf).min(0)
+    if not float(spans.max()) > LEAST_MOTION:
         raise InputError(
             f"{observation.source}: cannot tell: nothing moves by more than {LEAST_MOTION:g} px; film a motion"
         )
