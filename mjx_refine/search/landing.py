@@ -19,7 +19,7 @@ from jaxtyping import Float
 from mjx_refine.batch import SceneBatch
 from mjx_refine.search.features import DIRECTIONS, POINTS, Outlines
 from mjx_refine.space import Space
-from mjx_refine.view.seen import seen_moments, seen_point_flow, seen_supports
+from mjx_refine.view.seen import seen_point_flow, seen_supports
 
 if TYPE_CHECKING:
     from mjx_refine.search.derivatives import Automatic
@@ -48,15 +48,6 @@ NOISE_FLOOR = 0.5
 EDGE_WEIGHT = float(np.sqrt(6 / DIRECTIONS)) / NOISE_FLOOR
 MOTION_WEIGHT = float(np.sqrt(2 / POINTS)) / FLOW_NOISE
 """Of one direction of an outline, and of one coordinate of the flow at one point [1 / px at a picture 480 wide]."""
-
-
-MOMENT_WEIGHT = 1 / 0.12
-"""Of a whole mask's centroid (each axis) and equivalent radius [1 / px at a picture 480 wide]: means over an outline are
-known far better than any point of it."""
-
-
-STEP, FINE_STEP = 0.05, 0.001
-"""Of finite differences [prior widths]: the first looks over the jags of contacts, the second follows what is smooth."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,8 +104,6 @@ class LeastSquares:
       solver: what runs inside a stage: ``lm``, ours, or one of ``solvers``.
       automatic: derivatives where it has some; None: differences alone.
       fps: frames a second, for effects.
-      whole: centroids and equivalent radii of the masks [px] (``whole_masks``), to go by these as well; with differences
-        alone.
     """
 
     def __init__(
@@ -130,20 +119,21 @@ class LeastSquares:
         solver: str = "lm",
         automatic: Automatic | None = None,
         fps: float = 30.0,
-        whole: Float[np.ndarray, "frames masks 3"] | None = None,
     ):
         self.limit, self.seed, self.solver, self.automatic = limit, seed, solver, automatic
         self.space, self.rollout, self.image, self.fps = space, rollout, image, fps
         self.pixel = image[0] / 480.0
-        self.target = _of_columns(seen.support, columns)
+        target = np.full((len(seen.support), len(columns), DIRECTIONS), np.nan)
+        for n, j in enumerate(columns):
+            if j >= 0:
+                target[:, n] = seen.support[:, j]
+        self.target = target
         self.pixels, self.flow = _of_objects(flow, columns)
-        self.whole = None if whole is None else _of_columns(whole, columns)
-        self.step = STEP if whole is None else FINE_STEP
         self.spent = 0.0
 
     def distances(self, points: np.ndarray, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Simulated minus observed reach (B, frames, N, directions) and flow (B, frames, N, 2 * points, then moments where
-        these are compared), both in px at 480 wide, and whether a candidate diverged."""
+        """Simulated minus observed reach (B, frames, N, directions) and flow (B, frames, N, 2 * points), both in px at
+        480 wide, and whether a candidate diverged."""
         batch = self.space.decode(points)
         poses = self.rollout(batch, frames)
         self.spent += len(points) * frames / len(self.target)
@@ -160,9 +150,6 @@ class LeastSquares:
             moved = moved[:, :frames] - self.flow[:frames]
             moved[:, frames - 1] = np.nan
             flow = moved.reshape(*moved.shape[:3], -1)
-        if self.whole is not None:
-            moments = seen_moments(poses, batch, self.image, self.fps)[:, :frames] - self.whole[:frames]
-            flow = np.concatenate([flow, moments], -1)
         return reach / self.pixel, flow / self.pixel, bad
 
     def _robust(self, reach: np.ndarray, flow: np.ndarray, scale: float) -> np.ndarray:
@@ -172,10 +159,8 @@ class LeastSquares:
         flow at its points are independent: its directions together count as six, its flow as two vectors.
         """
         edges = slowed(np.nan_to_num(reach), scale) * EDGE_WEIGHT
-        points = flow.shape[-1] - (0 if self.whole is None else 3)
-        motion = slowed(np.nan_to_num(flow[..., :points]), FLOW_SCALE) * MOTION_WEIGHT
-        moments = slowed(np.nan_to_num(flow[..., points:]), scale) * MOMENT_WEIGHT
-        return np.concatenate([edges, motion, moments], -1)
+        motion = slowed(np.nan_to_num(flow), FLOW_SCALE) * MOTION_WEIGHT
+        return np.concatenate([edges, motion], -1)
 
     def residuals(self, points: np.ndarray, frames: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
         """(robust residuals (B, R), their half sum of squares with the prior (B,))."""
@@ -197,11 +182,11 @@ class LeastSquares:
             slopes = self._robust_slopes(base.reshape(columns.shape[1:]), frames, scale)
             result[:, held] = (columns / self.pixel * slopes).reshape(len(columns), -1).T
         if not held.all():
-            step = self.step * self.space.sigma
+            step = 0.05 * self.space.sigma
             sign = np.where(point + step > 1.0, -1.0, 1.0)
             points = (point + np.diag(sign * step))[~held]
             moved, _ = self.residuals(np.clip(points, 0.0, 1.0), frames, scale)
-            result[:, ~held] = ((moved - base) / (sign[~held, None] * self.step)).T
+            result[:, ~held] = ((moved - base) / (sign[~held, None] * 0.05)).T
         return result
 
     def _robust_slopes(self, base: np.ndarray, frames: int, scale: float) -> np.ndarray:
@@ -388,10 +373,5 @@ def _of_objects(flow, columns: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray 
         return np.zeros(0), None
     pixels, seen = flow
     chosen = [max(j, 0) for j in columns]
-    return pixels[:, chosen], _of_columns(seen, columns)
-
-
-def _of_columns(values: np.ndarray, columns: tuple[int, ...]) -> np.ndarray:
-    """The masks' values (frames, masks, ...) by object, NaN for one without a mask."""
-    lost = np.array([j < 0 for j in columns]).reshape(1, -1, *(1,) * (values.ndim - 2))
-    return np.where(lost, np.nan, values[:, [max(j, 0) for j in columns]])
+    lost = np.array([j < 0 for j in columns])
+    return pixels[:, chosen], np.where(lost[None, :, None, None], np.nan, seen[:, chosen])

@@ -22,7 +22,6 @@ from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.sim.separate import separate
 from mjx_refine.space.floor import levelled, tilted
 from mjx_refine.view.effects import needs_pictures
-from mjx_refine.view.moments import whole_masks
 from mjx_refine.view.picture_scorer import PictureScorer
 from mjx_refine.view.tiles import TileScorer, foreground
 
@@ -72,7 +71,6 @@ class Problem:
         masks = foreground(observation)
         self.seen: Outlines = outlines(masks)
         self.flow = flow_points(masks, observation.flow, self.seen.ids)
-        self.whole = whole_masks(masks, self.seen.ids)
         self.starts = self._ranked()
 
     def reference(self, shapes: tuple[Shape, ...]) -> MujocoSimulator:

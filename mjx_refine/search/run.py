@@ -17,7 +17,7 @@ from mjx_refine.search.checkpoint import damaged, input_digest, load_checkpoint,
 from mjx_refine.search.derivatives import DerivativeChoice, Derivatives
 from mjx_refine.search.intervals import Intervals, intervals
 from mjx_refine.search.landed import LANDED_WELL, Landed, first_covariance
-from mjx_refine.search.landing import LeastSquares, Stage, stages
+from mjx_refine.search.landing import LeastSquares, stages
 from mjx_refine.search.objective import Objective
 from mjx_refine.search.problem import Problem, Start, kind_of_scene
 from mjx_refine.search.progress import Progress, Step
@@ -35,9 +35,6 @@ LANDING_SHARE = 0.6
 GENERATIONS = 40
 """Generations for which the budget after a landing must suffice; the population shrinks, down to CMA-ES's default
 4 + 3 ln n (Hansen, The CMA Evolution Strategy: A Tutorial, 2023, table 1), until it does."""
-
-FINE = Stage(0, 2.0, 8)
-"""The last stage of a landing, on centroids and areas as well."""
 
 ELITES = 8
 """Candidates of the search that are compared at full resolution in the end."""
@@ -192,15 +189,10 @@ class Run:
 
         landing = squares.run(space.start, stages(self.problem.observation.length), hops, show)
         self.evaluations = before + landing.evaluations
-        fine = self._squares(start, space, limit - landing.evaluations, self.problem.whole)
-        last = fine.run(landing.point, [dataclasses.replace(FINE, frames=self.problem.observation.length)])
-        self.evaluations += last.evaluations
-        points = [landing.point, last.point]
-        scores = self.problem.score([space.scene_at(p) for p in points], start.matching)
-        best = int(np.nan_to_num(scores.fitness, nan=-np.inf).argmax())
-        return Landed(rank, points[best], landing.covariance, float(scores.fitness[best]), float(scores.iou[best]))
+        scores = self.problem.score([space.scene_at(landing.point)], start.matching)
+        return Landed(rank, landing.point, landing.covariance, float(scores.fitness[0]), float(scores.iou[0]))
 
-    def _squares(self, start: Start, space: Space, limit: int = 10**9, whole: np.ndarray | None = None) -> LeastSquares:
+    def _squares(self, start: Start, space: Space, limit: int = 10**9) -> LeastSquares:
         reference = self.problem.reference(start.scene.shapes)
         columns, image = self.problem.columns(start.matching), self.problem.observation.size
         return LeastSquares(
@@ -214,7 +206,6 @@ class Run:
             seed=self.options.seed,
             solver=self.options.solver,
             fps=reference.fps,
-            whole=whole,
         )
 
     def _beginning(self) -> tuple[Start, Space, np.ndarray, np.ndarray]:

@@ -13,7 +13,6 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting
 from mjx_refine.effects.kind import OutlineView
 from mjx_refine.scene import Shape
-from mjx_refine.view.moments import whole_function
 from mjx_refine.view.outline import BATCHES, Arrays, directions, larger, place, support_of, supports
 from mjx_refine.view.points import point_flow
 
@@ -41,7 +40,6 @@ def outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int
 
 
 _outline = jax.jit(outline_function, static_argnums=(0, 2, 3))
-_whole = jax.jit(whole_function, static_argnums=(0, 2))
 
 
 def _padded(poses: np.ndarray, batch: SceneBatch) -> Arrays:
@@ -116,18 +114,6 @@ def seen_supports(
         return supports(seen, batch, image, count)
     view = outline_view(seen, batch, image, count, fps)
     return view.reach + acting.outline_change(batch, view)
-
-
-def seen_moments(
-    poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch, image: tuple[int, int], fps: float
-) -> Float[np.ndarray, "batch frames objects 3"]:
-    """Centroids and equivalent radii of silhouettes with the effects of ``batch`` [px]; NaN where they hide nearly all."""
-    seen = acting.apparent(poses, batch, fps)
-    told = np.asarray(_whole(batch.shapes, _padded(seen, batch), image), np.float64)[: len(poses)]
-    if not acting.changes_outlines(batch):
-        return told
-    view = outline_view(seen, batch, image, 16, fps)
-    return changed_moments(told, batch, view, acting.outline_change(batch, view))
 
 
 def seen_point_flow(
