@@ -39,7 +39,7 @@ def clip_of(scene: Scene, frames: int = 20, seed: int = 0) -> Observation:
 
 
 def test_slack_whitens_the_covariance_of_its_columns():
-    columns = np.random.default_rng(0).normal(size=(12, 3)) * [3.0, 1.0, 0.1]
+    columns = np.random.default_rng(0).normal(size=(12, 3)) * [3.0, 1.0, 0.5]
     whitened = slack_of(columns)(np.eye(12))
     assert whitened @ (np.eye(12) + columns @ columns.T) @ whitened.T == pytest.approx(np.eye(12), abs=1e-9)
 
@@ -87,7 +87,7 @@ def test_closed_is_what_is_left_of_the_gap():
     assert HeldOut(np.ones(3), np.ones(3), 1.0, 0.0).closed == 0.0
 
 
-SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.5, 80.0, 1.0)
+SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
 
 
 @pytest.mark.parametrize(
