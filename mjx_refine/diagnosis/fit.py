@@ -164,7 +164,7 @@ class ClipFit:
             return np.sqrt(np.median(square.reshape(*square.shape[:3], -1).mean(-1), axis=0) / 2.0)
 
         m = self.measured
-        second = np.moveaxis([bend(told.moments[..., k : k + 1]) for k in range(3)], 0, -1)
+        second = np.stack([bend(told.moments[..., k : k + 1]) for k in range(3)], -1)
         self.noise = Noise(
             np.hypot(m.edge_noise, bend(told.reach)),
             np.hypot(m.flow_noise, bend(told.flow)),

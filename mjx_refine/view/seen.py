@@ -46,7 +46,8 @@ def _padded(poses: np.ndarray, batch: SceneBatch) -> Arrays:
     """Poses, sizes and cameras on the device, with rows added up to a size that is compiled."""
     arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
     size = next((b for b in BATCHES if b >= len(poses)), -(-len(poses) // BATCHES[-1]) * BATCHES[-1])
-    return tuple(jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32) for a in arrays)
+    added = size - len(poses)
+    return tuple(jnp.asarray(np.concatenate([a, np.repeat(a[:1], added, 0)]), jnp.float32) for a in arrays)  # type: ignore[return-value]
 
 
 def changed_moments(
