@@ -145,10 +145,13 @@ def _by_name(compared: Compared, said: Answer) -> dict[str, float]:
     return result
 
 
-def _chance(said: Answer, share: float, first: float) -> float:
-    """Probability of one effect of the catalogue: the named one's is the answer's, the others share the rest."""
+def chance(said: Answer, share: float, first: float) -> float:
+    """Probability of one effect of the catalogue: the named one's is the answer's, the others' are less in proportion to their
+    shares, and together not more than what is left."""
     if said.kind == "single":
-        return said.probability if share == first else (1 - said.probability) * share / max(1 - first, 1e-9)
+        if share == first:
+            return said.probability
+        return min(said.probability * share / first, (1 - said.probability) * share / max(1 - first, 1e-9))
     return (1 - said.probability) * share
 
 
@@ -196,7 +199,7 @@ def _gap(outside: HeldOut, scores, seed: int) -> Gap:
     iou = [float(s.iou[0]) for s in scores]
     epe = [float(s.epe[0]) for s in scores]
     return Gap(
-        metric="outlines, flow and background against the clip, root mean square over held-out frames, in widths of the noise",
+        metric="centroids, outlines, flow, background against the clip, root mean square over held-out frames, in noise widths",
         held_out="every third block of three frames",
         before=before,
         after=after,
@@ -235,7 +238,7 @@ def ranked(clip: ClipFit, compared: Compared, said: Answer, outside: HeldOut, be
         rows += [row(best, k, said.probability) for k in range(len(best.names))]
     told = {(r.effect, r.target) for r in rows}
     for candidate, share in zip(compared.candidates, said.shares, strict=True):
-        one = row(candidate, 0, _chance(said, share, max(said.shares)))
+        one = row(candidate, 0, chance(said, share, max(said.shares)))
         if (one.effect, one.target) not in told:
             rows.append(one)
     return (

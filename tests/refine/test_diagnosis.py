@@ -9,11 +9,12 @@ import pytest
 from own_clip import CAMERA, SIZE
 
 from mjx_refine.diagnosis import diagnose
+from mjx_refine.diagnosis.diagnose import chance
 from mjx_refine.diagnosis.fit import TAIL, prior
 from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.slack import impacts, slack_of, spins
-from mjx_refine.diagnosis.verdict import Signs, answer
+from mjx_refine.diagnosis.verdict import Answer, Signs, answer
 from mjx_refine.effects import batch_with_effects, catalogue
 from mjx_refine.effects.acting import apparent
 from mjx_refine.errors import InputError
@@ -167,3 +168,13 @@ def test_drag_is_named_and_measured():
     force = sum(first.parameters[name].value * speed**power for name, power in (("linear", 1), ("quadratic", 2)))
     assert force == pytest.approx(0.5 * speed**2, rel=0.3)
     assert sum(p.share for p in found.where) <= 1.0
+
+
+@pytest.mark.parametrize("probability", [0.3, 0.9])
+def test_what_is_named_is_likelier_than_what_is_not(probability):
+    shares = (0.6, 0.3, 0.1)
+    said = Answer("single", probability, shares)
+    told = [chance(said, share, shares[0]) for share in shares]
+    assert told[0] == probability
+    assert told == sorted(told, reverse=True)
+    assert sum(told) <= 1.0 + 1e-9
