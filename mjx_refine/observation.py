@@ -8,6 +8,7 @@ import os
 import warnings
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,8 @@ _KEYS = ("flow", "masks", "fps", "frames", "flow_sigma")
 MAX_ELEMENTS = 2 * 10**9
 MAX_FLOW = 1e5
 _READERS = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
-DAMAGED = (OSError, ValueError, EOFError, KeyError, TypeError, SyntaxError, RuntimeError, MemoryError, OverflowError)
-DAMAGED += (zipfile.BadZipFile, zlib.error, lzma.LZMAError)
+_DAMAGED = (OSError, ValueError, EOFError, KeyError, TypeError, SyntaxError, RuntimeError, MemoryError, OverflowError)
+_DAMAGED += (zipfile.BadZipFile, zlib.error, lzma.LZMAError)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,27 +69,33 @@ def load_observation(path: str | os.PathLike) -> Observation:
     """
     path = Path(path)
     check_sizes(path)
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            _check_keys(path, archive.files)
-            arrays = {key: archive[key] for key in archive.files}
-    except InputError:
-        raise
-    except DAMAGED as error:
-        reason = (
-            "it holds pickled objects"
-            if "allow_pickle" in str(error) or "Object arrays" in str(error)
-            else str(error)[:200]
-        )
-        raise InputError(f"{path}: cannot be read as npz ({reason}); write it again with numpy.savez") from error
+    arrays = read_arrays(path, _KEYS, ("flow", "fps"))
     return make_observation(source=str(path), **arrays)
 
 
-def _check_keys(path: Path, keys: list[str]) -> None:
+def read_arrays(path: Path, known: Sequence[str], needed: Sequence[str]) -> dict[str, np.ndarray]:
+    """The arrays of an npz.
+
+    Raises:
+      InputError: it is no npz, holds pickles or an unknown key, or lacks one that is needed.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            _check_keys(path, archive.files, known, needed)
+            return {key: archive[key] for key in archive.files}
+    except InputError:
+        raise
+    except _DAMAGED as error:
+        pickled = "allow_pickle" in str(error) or "Object arrays" in str(error)
+        reason = "it holds pickled objects" if pickled else str(error)[:200]
+        raise InputError(f"{path}: cannot be read as npz ({reason}); write it again with numpy.savez") from error
+
+
+def _check_keys(path: Path, keys: list[str], known: Sequence[str], needed: Sequence[str]) -> None:
     for key in keys:
-        if key not in _KEYS:
-            raise InputError(f"{path}: unknown key {key[:60]!r}; expected {', '.join(_KEYS)}; remove or rename it")
-    for key in ("flow", "fps"):
+        if key not in known:
+            raise InputError(f"{path}: unknown key {key[:60]!r}; expected {', '.join(known)}; remove or rename it")
+    for key in needed:
         if key not in keys:
             raise InputError(f"{path}: the key {key!r} is missing; found {', '.join(keys)[:200] or 'nothing'}; add it")
 
@@ -102,7 +109,7 @@ def check_sizes(path: Path) -> None:
             need = sum(_declared_bytes(path, archive, info) for info in archive.infolist())
     except InputError:
         raise
-    except DAMAGED as error:
+    except _DAMAGED as error:
         raise InputError(
             f"{path}: not a readable npz of plain arrays ({str(error)[:200]}); write it with numpy.savez"
         ) from error

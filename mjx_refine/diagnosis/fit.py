@@ -191,12 +191,14 @@ class ClipFit:
     # --- residuals ------------------------------------------------------------------------------------------------
     def distances(self, prediction: Prediction) -> Parts:
         """Predicted minus measured [px]; NaN where nothing was measured."""
-        parts = [told - seen for told, seen in zip(prediction.parts, self.measured.parts, strict=True)]
-        for k in (0, 2):
+        measured = self.measured.parts
+        away = Parts(*(told - seen for told, seen in zip(prediction.parts, measured, strict=True)))
+
+        def missed(part: np.ndarray, seen: np.ndarray) -> np.ndarray:
             # An object that nothing shows any more, where a mask is, misses it by its whole size.
-            lost = np.isnan(prediction.parts[k]) & np.isfinite(self.measured.parts[k])
-            parts[k] = np.where(lost, 30.0, parts[k])
-        return Parts(*parts)
+            return np.where(np.isnan(part) & np.isfinite(seen), 30.0, part)
+
+        return away._replace(reach=missed(away.reach, measured.reach), moments=missed(away.moments, measured.moments))
 
     def whitened(
         self,
@@ -220,12 +222,10 @@ class ClipFit:
 
     def expected(self, beside: bool = True) -> float:
         """Sum of squares that noise alone would give, with the background's or without."""
-        parts, fresh = self.measured.parts, self.measured.freshness
-        seen = [np.isfinite(part) for part in parts]
-        total = [float(np.sum(part)) for part in seen]
-        total[0] = float((seen[0].sum(-1) * fresh).sum())
-        total[2] = float((seen[2].sum(-1) * fresh).sum())
-        each = [count * number for count, number in zip(self.counts.of(parts), total, strict=True)]
+        parts, fresh = self.measured.parts, self.measured.freshness[..., None]
+        seen = Parts(*(np.isfinite(part).astype(float) for part in parts))
+        seen = seen._replace(reach=seen.reach * fresh, moments=seen.moments * fresh)
+        each = [count * float(part.sum()) for count, part in zip(self.counts.of(parts), seen, strict=True)]
         return max(sum(each if beside else each[:-1]), 1.0)
 
     def misfit(self, fit: Fit) -> float:

@@ -29,7 +29,6 @@ LEAST = 0.25
 MOST = 8
 """Impacts an object that are looked at, strongest first."""
 
-
 FELT = 0.2
 """Error in noise widths below which nobody would see it."""
 
@@ -122,8 +121,8 @@ def sustained(
         rim = np.linalg.norm(spin[:, n], axis=-1) * float(batch.size[0, n, 0])
         rolls = batch.shapes[n] != "box" and bool(np.median(rim - 0.5 * np.linalg.norm(velocity[:, n], axis=-1)) > 0)
         share, least = ROLLING if rolls else SLIDING
-        touching = np.concatenate([[False], on_floor[:, n], [False]])
-        edges = np.nonzero(np.diff(touching.astype(int)))[0]
+        padded = np.concatenate([[False], on_floor[:, n], [False]])
+        edges = np.nonzero(np.diff(padded.astype(int)))[0]
         for first, end in zip(edges[::2], edges[1::2], strict=True):
             if end - first < SHORTEST:
                 continue

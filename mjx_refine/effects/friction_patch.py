@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Motion, Start, fastest
+from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Motion, Start, glance
 
 
 class FrictionPatch(EffectKind):
@@ -29,7 +29,7 @@ class FrictionPatch(EffectKind):
 
     def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
         away = np.linalg.norm(motion.position[..., :2] - values[:, None, :2], axis=-1)
-        return float(np.abs(away - values[:, 2:3]).min()) / fastest(motion)
+        return glance(motion, float(np.abs(away - values[:, 2:3]).min()))
 
     def starts(self, view: FitView, target: int) -> list[Start]:
         found = []

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
-from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Loads, Motion, Start, fastest, of_target
+from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Loads, Motion, Start, glance, of_target
 
 STIFFNESS = 20000.0
 """Of the wall's contact at most [1/s^2]."""
@@ -53,7 +53,7 @@ class HiddenObstacle(EffectKind):
 
     def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
         gap = -_met(motion, target, values)[2]
-        return float(np.where(gap > 0, gap, 0.0).min()) / fastest(motion)
+        return glance(motion, float(np.where(gap > 0, gap, 0.0).min()))
 
     def starts(self, view: FitView, target: int) -> list[Start]:
         found = []

@@ -319,8 +319,13 @@ def of_target(batch: SceneBatch, target: int, vector: np.ndarray) -> np.ndarray:
     return result
 
 
-def fastest(motion: Motion) -> float:
-    """A speed that no point of a body will exceed while it is looked away from [m/s]."""
+GLANCE, GAIN = 0.1, 2.0
+"""Longest time for which nobody looks at where bodies are [s], and the speed that they may gain in it [m/s]: gravity gives
+half of that."""
+
+
+def glance(motion: Motion, gap: float) -> float:
+    """For how long no body can cover ``gap`` [m], surely [s]."""
     speed = np.linalg.norm(motion.velocity, axis=-1)
     rim = np.linalg.norm(motion.spin, axis=-1) * np.linalg.norm(motion.batch.size, axis=-1)
-    return float(np.nan_to_num((speed + rim).max(), nan=0.0)) + 2.0
+    return min(gap / (float(np.nan_to_num((speed + rim).max(), nan=0.0)) + GAIN), GLANCE)

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 import yaml
+from effect_scenes import BALL, CAMERA, FPS, GRAVITY, effect, rolled_out
 
 from mjx_refine import rotations
 from mjx_refine.cli.main import run
@@ -17,33 +18,12 @@ from mjx_refine.effects.registry import ENTRY_POINT
 from mjx_refine.errors import InputError
 from mjx_refine.export import export_xml
 from mjx_refine.observation import load_observation
-from mjx_refine.scene import Body, Camera, Effect, Scene, load_scene
+from mjx_refine.scene import Body, Scene, load_scene
 from mjx_refine.scene.write import dump_scene, save_scene
 from mjx_refine.sim import backends
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.simulate import simulate
 from mjx_refine.space import Space
-
-FPS = 30.0
-STEP = 1 / (8 * FPS)
-GRAVITY = 9.81
-CAMERA = Camera((0.0, -3.0, 2.0), 60.0, 45.0)
-BALL = Body("sphere", "ball", (0.2,), (0.0, 0.0, 50.0), mass=0.7)
-
-
-def effect(name: str, target: str | None = None, **parameters) -> Effect:
-    return Effect(
-        name, target, tuple((k, tuple(v) if isinstance(v, list) else float(v)) for k, v in parameters.items())
-    )
-
-
-def rolled_out(
-    *effects: Effect, frames: int = 31, gravity: float = 0.0, body: Body = BALL, others=(), **state
-) -> np.ndarray:
-    """Poses (frames, objects, 7)."""
-    scene = Scene((dataclasses.replace(body, **state), *others), CAMERA, (0.0, 0.0, -gravity), effects)
-    return MujocoSimulator(scene.shapes, FPS, 1).rollout(batch_with_effects([scene]), frames)[0]
-
 
 # Entries of scene files -------------------------------------------------------------------------------------------------
 

@@ -7,6 +7,7 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+from effect_scenes import effect
 from scipy import ndimage
 
 from mjx_refine import rotations
@@ -29,12 +30,6 @@ SIZE = (240, 160)
 PITCH = np.deg2rad(60.0)
 CAMERA = Camera((0.2, -3.0, 2.0), 60.0, 45.0)
 FOCAL = SIZE[1] / 2 / np.tan(np.deg2rad(22.5))
-
-
-def effect(name: str, target: str | None = None, **parameters) -> Effect:
-    return Effect(
-        name, target, tuple((k, tuple(v) if isinstance(v, list) else float(v)) for k, v in parameters.items())
-    )
 
 
 def batch_of(*effects: Effect, scene: Scene | None = None) -> SceneBatch:

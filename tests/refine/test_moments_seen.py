@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from effect_scenes import effect
 from own_clip import FLIGHT, OwnClip
 
 from mjx_refine.batch import SceneBatch
@@ -15,7 +16,7 @@ from mjx_refine.diagnosis.predict import Predictor
 from mjx_refine.diagnosis.slack import slack_of, sustained, touching
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.observation import Observation
-from mjx_refine.scene import Body, Camera, Effect, Scene
+from mjx_refine.scene import Body, Camera, Scene
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.view.effects import draw_effects
 from mjx_refine.view.moments import whole_masks
@@ -30,10 +31,6 @@ SCENE = Scene(
     ),
     Camera((0.2, -3.0, 2.0), 60.0, 45.0),
 )
-
-
-def effect(name: str, target: str | None = None, **parameters) -> Effect:
-    return Effect(name, target, tuple((k, float(v)) for k, v in parameters.items()))
 
 
 def seen_moments(poses: np.ndarray, batch: SceneBatch) -> np.ndarray:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from mjx_refine import rotations
 from mjx_refine.errors import InputError
-from mjx_refine.observation import DAMAGED, check_sizes
+from mjx_refine.observation import check_sizes, read_arrays
 
 _KEYS = ("time", "pos", "quat", "names", "sigma_pos", "sigma_rot")
 _NEEDED = ("time", "pos", "quat")
@@ -62,26 +62,7 @@ def load_poses(path: str | os.PathLike) -> Poses:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected measured poses (npz with {', '.join(_NEEDED)}); name another")
     check_sizes(path)
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            _check_keys(path, archive.files)
-            arrays = {key: archive[key] for key in archive.files}
-    except InputError:
-        raise
-    except DAMAGED as error:
-        pickled = "allow_pickle" in str(error) or "Object arrays" in str(error)
-        reason = "it holds pickled objects" if pickled else str(error)[:200]
-        raise InputError(f"{path}: cannot be read as npz ({reason}); write it again with numpy.savez") from error
-    return make_poses(source=str(path), **arrays)
-
-
-def _check_keys(path: Path, keys: list[str]) -> None:
-    for key in keys:
-        if key not in _KEYS:
-            raise InputError(f"{path}: unknown key {key[:60]!r}; expected {', '.join(_KEYS)}; remove or rename it")
-    for key in _NEEDED:
-        if key not in keys:
-            raise InputError(f"{path}: the key {key!r} is missing; found {', '.join(keys)[:200] or 'nothing'}; add it")
+    return make_poses(source=str(path), **read_arrays(path, _KEYS, _NEEDED))
 
 
 def make_poses(
