@@ -65,7 +65,9 @@ def load_proposals(path: Path) -> Proposals:
     size: tuple[int, int] | None = None
     for i, frame in enumerate(listed):
         where = f"{path}: frames[{i}]"
-        number = plain.whole(frame, "frame_index", where) if "frame_index" in frame else i
+        number = (
+            plain.whole(frame, "frame_index", where) if not isinstance(frame, dict) or "frame_index" in frame else i
+        )
         if number in numbered:
             raise InputError(f"{where}.frame_index = {number} is there twice; expected each frame once; correct it")
         finds = []
