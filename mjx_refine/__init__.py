@@ -4,12 +4,14 @@
 """
 
 from mjx_refine.errors import InputError
+from mjx_refine.generate import GenerateOptions, Record, generate_scenes, read_records
 from mjx_refine.many import Job, Many, Outcome, load_jobs, refine_many
 from mjx_refine.observation import Observation, load_observation, make_observation, save_observation
 from mjx_refine.scene import Scene, load_scene, load_scenes, parse_scenes, save_scene, save_scenes
 from mjx_refine.search import Options, Progress, RefineResult, refine
 
 __all__ = [
+    "GenerateOptions",
     "InputError",
     "Job",
     "Many",
@@ -17,14 +19,17 @@ __all__ = [
     "Options",
     "Outcome",
     "Progress",
+    "Record",
     "RefineResult",
     "Scene",
+    "generate_scenes",
     "load_jobs",
     "load_observation",
     "load_scene",
     "load_scenes",
     "make_observation",
     "parse_scenes",
+    "read_records",
     "refine",
     "refine_many",
     "save_observation",

@@ -28,7 +28,7 @@ LAYERS = (
     {"search"},
     {"diagnosis"},
     {"simulate", "export", "observe", "guess", "describe"},
-    {"evaluate"},
+    {"evaluate", "generate"},
     {"report", "edit"},
     {"many"},
     {"__init__"},

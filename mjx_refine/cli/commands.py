@@ -14,6 +14,7 @@ from mjx_refine.cli.describe import describe
 from mjx_refine.cli.diagnose import diagnose
 from mjx_refine.cli.edit import edit
 from mjx_refine.cli.evaluate import evaluate
+from mjx_refine.cli.generate import generate
 from mjx_refine.cli.many import ENGINES, refine_many_command
 from mjx_refine.cli.types import FiniteFloat, Size
 from mjx_refine.errors import InputError
@@ -217,3 +218,4 @@ app.add_command(diagnose)
 app.add_command(describe)
 app.add_command(edit)
 app.add_command(evaluate)
+app.add_command(generate)

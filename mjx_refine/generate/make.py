@@ -50,14 +50,20 @@ class Tally:
     proposals: int = 0
     rejected: collections.Counter = dataclasses.field(default_factory=collections.Counter)
     kinds: collections.Counter = dataclasses.field(default_factory=collections.Counter)
-    seconds: collections.Counter = dataclasses.field(default_factory=collections.Counter)
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
 
     def add(self, other: Tally) -> None:
         """Counts ``other`` too."""
         self.records += other.records
         self.proposals += other.proposals
-        for mine, theirs in ((self.rejected, other.rejected), (self.kinds, other.kinds), (self.seconds, other.seconds)):
-            mine.update(theirs)
+        self.rejected.update(other.rejected)
+        self.kinds.update(other.kinds)
+        for part, seconds in other.seconds.items():
+            self.spent(part, seconds)
+
+    def spent(self, part: str, seconds: float) -> None:
+        """Adds to the time that ``part`` took."""
+        self.seconds[part] = self.seconds.get(part, 0.0) + seconds
 
     def rates(self) -> dict[str, dict[str, float]]:
         """How many proposals each filter was asked about, and the share that passed it."""
@@ -73,7 +79,7 @@ class Tally:
         """Adds the time that the block takes to ``part``."""
         began = time.perf_counter()
         yield
-        self.seconds[part] += time.perf_counter() - began
+        self.spent(part, time.perf_counter() - began)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -108,8 +108,8 @@ def _draw_part(clips: list[Clip]) -> list[Pictures]:
     places, start, first = [], 0, 0
     for clip in clips:
         where = _sort_tiles(clip, first, start, work)
-        places.append((where, slice(start, start + len(where[0]))))
-        first, start = first + clip.qpos.shape[1], start + len(where[0])
+        places.append((where, slice(start, start + len(where))))
+        first, start = first + clip.qpos.shape[1], start + len(where)
     ids, flow = np.zeros((start, SIDE * SIDE), np.uint8), np.zeros((start, 2, SIDE * SIDE), np.float16)
     frames = _prepared(clips)
     size = CHUNK.get(jax.default_backend(), CHUNK_ELSEWHERE)
@@ -121,12 +121,12 @@ def _draw_part(clips: list[Clip]) -> list[Pictures]:
     for place, count, (some_ids, some_flow) in drawn:
         ids[place], flow[place] = np.asarray(some_ids)[:count], np.asarray(some_flow)[:count]
     return [
-        _gathered(*where, ids[part], flow[part], clip.qpos.shape[1])
+        _gathered(where, ids[part], flow[part], clip.qpos.shape[1])
         for clip, (where, part) in zip(clips, places, strict=True)
     ]
 
 
-def _sort_tiles(clip: Clip, first: int, start: int, work: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sort_tiles(clip: Clip, first: int, start: int, work: dict) -> Int[np.ndarray, "tiles 3"]:
     """Adds a clip's tiles to ``work``; returns their (frame, row, column), in that order.
 
     ``first`` is the number of the clip's first object among the prepared ones, ``start`` its first place in the output.
@@ -135,11 +135,11 @@ def _sort_tiles(clip: Clip, first: int, start: int, work: dict) -> tuple[np.ndar
     code = np.zeros(touched.shape[1:], np.uint32)
     for number, tiles in enumerate(touched):
         code |= tiles.astype(np.uint32) << np.uint32(number)
-    where = np.nonzero(code)
-    code = code[where]
+    where = np.argwhere(code)
+    code = code[code > 0]
     for one in np.unique(code):
         here = np.nonzero(code == one)[0]
-        time = where[0][here]
+        time = where[here, 0]
         objects = [n for n in range(len(touched)) if one >> n & 1]
         signature, slots = slots_of(tuple(clip.batch.shapes[n] for n in objects))
         part = work.setdefault(signature, _Work())
@@ -149,7 +149,7 @@ def _sort_tiles(clip: Clip, first: int, start: int, work: dict) -> tuple[np.ndar
             labels[k + 1] = 0 if slot is None else objects[slot] + 1
         part.frames.append(rows)
         part.lead.append((first + objects[0]) * FRAMES + time)
-        part.corner.append(np.stack([where[1][here], where[2][here]], -1))
+        part.corner.append(where[here, 1:])
         part.labels.append(np.broadcast_to(labels, (len(here), len(labels))))
         part.place.append(here + start)
     return where
@@ -238,10 +238,9 @@ _OF_OBJECTS = ("ray", "origin", "size", "next_matrix", "next_offset")
 _OF_CAMERAS = ("down", "height", "focal")
 
 
-def _gathered(
-    time: np.ndarray, row: np.ndarray, column: np.ndarray, ids: np.ndarray, flow: np.ndarray, objects: int
-) -> Pictures:
+def _gathered(where: Int[np.ndarray, "tiles 3"], ids: np.ndarray, flow: np.ndarray, objects: int) -> Pictures:
     """Runs and flow row by row, from tiles in the order of frame, row and column."""
+    time, row, column = where.T
     band = time * GRID[0] + row
     begins = np.concatenate([[True], band[1:] != band[:-1]]) if len(band) else np.zeros(0, bool)
     number = np.cumsum(begins) - 1

@@ -147,7 +147,7 @@ def _lights(spec: mujoco.MjSpec, scene: Scene, generator: np.random.Generator) -
     middle = np.mean([body.position for body in scene.objects], 0) * [1, 1, 0]
     count = int(generator.integers(1, 4))
     for number in range(count):
-        place = middle + [*generator.uniform(-3, 3, 2), generator.uniform(3.0, 6.0)]
+        place = middle + generator.uniform([-3, -3, 3], [3, 3, 6])
         strength = generator.uniform(0.4, 0.9, 1) * generator.uniform(0.8, 1.0, 3) / count**0.5
         spec.worldbody.add_light(
             pos=place, dir=middle - place, castshadow=number == 0, diffuse=strength, specular=0.4 * strength,

@@ -2,35 +2,23 @@
 
 from __future__ import annotations
 
-import concurrent.futures
 import contextlib
 import dataclasses
 import json
-import multiprocessing
 import os
-import signal
-import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from mjx_refine import files
 from mjx_refine.errors import InputError
-from mjx_refine.generate.make import Maker, Tally
+from mjx_refine.generate.make import Tally
 from mjx_refine.generate.options import GenerateOptions
-from mjx_refine.generate.shards import finished, make_folder, tally_of, write_shard, written_options
+from mjx_refine.generate.shards import finished, make_folder, tally_of, written_options
+from mjx_refine.generate.workers import Job, worked
 
 MOST_RECORDS = 10**8
 DEVICES = ("auto", "cpu", "gpu")
-
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-    "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
-}
-"""Environment of a worker: the processes share the cores, and a GPU's memory."""
 
 
 class GenerateProgress:
@@ -53,7 +41,7 @@ class Summary:
       made: records that this call made.
       bytes: of all shards of the share.
       seconds: that the call took.
-      device: where the pictures were drawn.
+      device: where the pictures were drawn; None: there was nothing left to draw.
       path: the JSON file with all this.
     """
 
@@ -62,24 +50,13 @@ class Summary:
     made: int
     bytes: int
     seconds: float
-    device: str
+    device: str | None
     path: Path
 
     @property
     def rate(self) -> float:
         """Scenes a second that this call made."""
         return self.made / self.seconds
-
-
-@dataclasses.dataclass(frozen=True)
-class _Job:
-    """One shard to be written."""
-
-    out: Path
-    number: int
-    records: int
-    options: GenerateOptions
-    device: str
 
 
 def generate_scenes(
@@ -114,18 +91,20 @@ def generate_scenes(
     options, progress = options or GenerateOptions(), progress or GenerateProgress()
     began, out = time.perf_counter(), Path(out)
     jobs = _jobs(count, out, options, shard, resume, device)
-    tally, made, size, drawn_on = Tally(), 0, 0, ""
+    tally, made, size, drawn_on = Tally(), 0, 0, None
     kept, total = jobs.kept, sum(job.records for job in jobs.left) + sum(told["records"] for told in jobs.kept)
     for told in kept:
         tally.add(tally_of(told))
         size += told["bytes"]
-    try:
-        for part, written, drawn_on in _worked(jobs.left, _workers(workers, len(jobs.left), options)):
-            tally.add(part)
-            made, size = made + part.records, size + written
-            progress.update(tally.records, total, tally)
-    finally:
-        progress.close()
+    processes = _workers(workers, len(jobs.left), options)
+    with _folder(out, alone=shard[1] == 1):
+        try:
+            for part, written, kind in worked(jobs.left, processes):
+                tally.add(part)
+                made, size, drawn_on = made + part.records, size + written, kind
+                progress.update(tally.records, total, tally)
+        finally:
+            progress.close()
     path = out / _summary_name(options, shard)
     summary = Summary(out, tally, made, size, time.perf_counter() - began, drawn_on, path)
     files.write_text(path, json.dumps(told_summary(summary, options, shard), indent=1) + "\n")
@@ -161,12 +140,12 @@ def _summary_name(options: GenerateOptions, shard: tuple[int, int]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Jobs:
-    left: list[_Job]
+    left: list[Job]
     kept: list[dict]
 
 
 def _jobs(count: int, out: Path, options: GenerateOptions, shard: tuple[int, int], resume: bool, device: str) -> _Jobs:
-    """The shards of this machine that are still to be written, and those that are there; makes ``out``."""
+    """The shards of this machine that are still to be written, and those that are there."""
     if not 1 <= count <= MOST_RECORDS:
         raise InputError(f"{count} scenes; expected 1 <= count <= {MOST_RECORDS}")
     if not 1 <= shard[0] <= shard[1]:
@@ -189,11 +168,24 @@ def _jobs(count: int, out: Path, options: GenerateOptions, shard: tuple[int, int
         if told is not None and told["records"] >= records:
             kept.append(told)
         else:
-            left.append(_Job(out, number, records, options, device))
-    make_folder(out)
-    if shard[1] == 1:
-        files.remove_stale_parts(out)
+            left.append(Job(out, number, records, options, device))
     return _Jobs(left, kept)
+
+
+@contextlib.contextmanager
+def _folder(out: Path, alone: bool) -> Iterator[None]:
+    """Makes ``out``; where the call turns out to be wrong it is gone again. ``alone``: no other machine writes there."""
+    added = [folder for folder in (out, *out.parents) if not folder.exists()]
+    make_folder(out)
+    if alone:
+        files.remove_stale_parts(out)
+    try:
+        yield
+    except InputError:
+        for folder in added:
+            with contextlib.suppress(OSError):  # it holds something
+                folder.rmdir()
+        raise
 
 
 def cores() -> int:
@@ -208,105 +200,3 @@ def _workers(workers: int | None, jobs: int, options: GenerateOptions) -> int:
     wanted = max(1, min(workers or cores(), jobs))
     # A renderer is chosen when MuJoCo is imported, which this process has done.
     return wanted if wanted > 1 or options.rgb else 0
-
-
-def _worked(jobs: list[_Job], workers: int) -> Iterator[tuple[Tally, int, str]]:
-    """The outcome of every job, as they end."""
-    if not jobs:
-        return
-    if workers == 0:
-        maker = Maker(jobs[0].options)
-        for job in jobs:
-            yield _write(job, maker)
-        return
-    context = multiprocessing.get_context("spawn")
-    pool = concurrent.futures.ProcessPoolExecutor(workers, context, _begin, (jobs[0],))
-    try:
-        with _environment(jobs[0]):
-            futures = [pool.submit(_work, job) for job in jobs]
-        for future in concurrent.futures.as_completed(futures):
-            yield future.result()
-        pool.shutdown()
-    except BrokenProcessPool as error:
-        raise RuntimeError(
-            "a worker process ended: was memory short (choose fewer --workers), or does a script call generate_scenes "
-            "without `if __name__ == '__main__':` around it?"
-        ) from error
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            process.terminate()
-        for process in multiprocessing.active_children():
-            process.join()
-
-
-@contextlib.contextmanager
-def _environment(job: _Job) -> Iterator[None]:
-    """What worker processes inherit; what the user has set stays."""
-    values = dict(ONE_THREAD)
-    if job.options.rgb and "DISPLAY" not in os.environ:
-        values["MUJOCO_GL"] = "egl"
-    if job.device == "cpu":
-        values["JAX_PLATFORMS"] = "cpu"
-    added = [name for name in values if name not in os.environ]
-    os.environ.update({name: values[name] for name in added})
-    try:
-        yield
-    finally:
-        for name in added:
-            os.environ.pop(name, None)
-
-
-_MAKERS: dict[GenerateOptions, Maker] = {}
-
-
-def _begin(job: _Job) -> None:
-    """Before a worker's first job."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends us
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    _MAKERS[job.options] = Maker(job.options)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _work(job: _Job) -> tuple[Tally, int, str]:
-    return _write(job, _MAKERS[job.options])
-
-
-def _write(job: _Job, maker: Maker) -> tuple[Tally, int, str]:
-    """Writes one shard."""
-    import jax
-
-    from mjx_refine.compile_cache import enable_cache
-
-    enable_cache()
-    device = _device(job.device)
-    if job.options.rgb:
-        from mjx_refine.generate.rgb import check_renderer
-
-        check_renderer()
-    tally, first = Tally(), job.number * job.options.per_shard
-    began = time.perf_counter()
-    with jax.default_device(device):
-        indices = range(first, first + job.records)
-        size = write_shard(job.out, job.number, job.options, maker.records(indices, tally), tally)
-    tally.seconds["writing"] += time.perf_counter() - began - sum(tally.seconds.values())
-    return tally, size, device.device_kind
-
-
-def _device(name: str):
-    """The JAX device that ``name`` means here."""
-    import jax
-
-    try:
-        return jax.devices(None if name == "auto" else name)[0]
-    except RuntimeError as error:
-        raise InputError(
-            f"device {name}: JAX sees none here; pip install 'mjx-refine[warp]' on a machine with an NVIDIA GPU, or choose "
-            "--device cpu"
-        ) from error

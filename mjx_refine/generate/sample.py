@@ -91,6 +91,7 @@ class _Draw:
         cosine, sine = math.cos(pitch), math.sin(pitch)
         half = math.tan(math.radians(self.camera.fovy) / 2)
         eye = self.camera.position
+        right, ahead, reach = 0.0, 0.0, 0.0
         for _ in range(50):
             right = self.uniform(-0.85, 0.85) * half * SIZE[0] / SIZE[1]
             up = self.uniform(-0.8, 0.8) * half
@@ -109,7 +110,8 @@ class _Draw:
         # Upwards, so that nothing begins inside the floor.
         height = math.ceil(height * 1e4) / 1e4
         x, y = self.spot(height)
-        across = (0.0, 0.0) if self.chance(0.3) else self.velocity(x, y, height, others)
+        # The first object always moves.
+        across = (0.0, 0.0) if others and self.chance(0.3) else self.velocity(x, y, height, others)
         # Some come into view only later.
         late = self.uniform(0.0, 0.5) if self.chance(0.3) else 0.0
         rise = self.uniform(-1.0, 3.0) if flies and self.chance(0.7) else 0.0

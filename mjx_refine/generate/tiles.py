@@ -52,7 +52,7 @@ class Boxes:
     @property
     def seen(self) -> Bool[np.ndarray, "objects"]:
         """Whether an object may ever be in view."""
-        return (self.pixels > 0).any(0)
+        return np.asarray((self.pixels > 0).any(0))
 
 
 def bounding_boxes(qpos: Float[np.ndarray, "frames objects 7"], batch: SceneBatch, row: int) -> Boxes:

@@ -1,0 +1,166 @@
+"""Shards written by this process or by several, each of which is warned, watched and ended with the call."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+from mjx_refine.errors import InputError
+from mjx_refine.generate.make import Maker, Tally
+from mjx_refine.generate.options import GenerateOptions
+from mjx_refine.generate.shards import shard_name, write_shard
+
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+    "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+}
+"""Environment of a worker: the processes share the cores, and a GPU's memory."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One shard to be written.
+
+    Attributes:
+      out: folder.
+      number: of the shard.
+      records: in it.
+      options: of all records.
+      device: where pictures are drawn.
+    """
+
+    out: Path
+    number: int
+    records: int
+    options: GenerateOptions
+    device: str
+
+
+def worked(jobs: list[Job], workers: int) -> Iterator[tuple[Tally, int, str]]:
+    """(tally, bytes, device) of every job, as they end, by so many processes; 0: by this one.
+
+    Raises:
+      InputError: a job cannot be done.
+      RuntimeError: a process was killed.
+    """
+    if not jobs:
+        return
+    if workers == 0:
+        maker = Maker(jobs[0].options)
+        for job in jobs:
+            yield _write(job, maker)
+        return
+    context, beside = multiprocessing.get_context("spawn"), set(multiprocessing.active_children())
+    pool = concurrent.futures.ProcessPoolExecutor(workers, context, _begin, (jobs[0],))
+    try:
+        with _environment(jobs[0]):
+            futures = [pool.submit(_work, job) for job in jobs]
+        for future in concurrent.futures.as_completed(futures):
+            yield future.result()
+        pool.shutdown()
+    except BrokenProcessPool as error:
+        raise RuntimeError(
+            "a worker process ended: was memory short (choose fewer --workers), or does a script call generate_scenes "
+            "without `if __name__ == '__main__':` around it?"
+        ) from error
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        mine = set(multiprocessing.active_children()) - beside
+        for process in mine:
+            process.terminate()
+        for process in mine:
+            process.join()
+
+
+@contextlib.contextmanager
+def _environment(job: Job) -> Iterator[None]:
+    """What worker processes inherit; what the user has set stays."""
+    values = dict(ONE_THREAD)
+    if job.options.rgb and "DISPLAY" not in os.environ:
+        values["MUJOCO_GL"] = "egl"
+    if job.device == "cpu":
+        values["JAX_PLATFORMS"] = "cpu"
+    added = [name for name in values if name not in os.environ]
+    os.environ.update({name: values[name] for name in added})
+    try:
+        yield
+    finally:
+        for name in added:
+            os.environ.pop(name, None)
+
+
+_MAKERS: dict[GenerateOptions, Maker] = {}
+_AT_WORK: list[Job] = []
+
+
+def _begin(job: Job) -> None:
+    """Before a worker's first job."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends us
+    signal.signal(signal.SIGTERM, lambda *_: _end())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _MAKERS[job.options] = Maker(job.options)
+
+
+def _end() -> None:
+    """Ends this worker without leaving half a shard."""
+    for job in _AT_WORK:
+        for part in job.out.glob(f".{shard_name(job.options.split, job.number)}.*.part"):
+            part.unlink(missing_ok=True)
+    os._exit(1)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        _end()
+
+
+def _work(job: Job) -> tuple[Tally, int, str]:
+    _AT_WORK[:] = [job]
+    return _write(job, _MAKERS[job.options])
+
+
+def _write(job: Job, maker: Maker) -> tuple[Tally, int, str]:
+    """Writes one shard."""
+    import jax
+
+    from mjx_refine.compile_cache import enable_cache
+
+    enable_cache()
+    device = _device(job.device)
+    if job.options.rgb:
+        from mjx_refine.generate.rgb import check_renderer
+
+        check_renderer()
+    tally, first = Tally(), job.number * job.options.per_shard
+    began = time.perf_counter()
+    with jax.default_device(device):
+        indices = range(first, first + job.records)
+        size = write_shard(job.out, job.number, job.options, maker.records(indices, tally), tally)
+    tally.spent("writing", time.perf_counter() - began - sum(tally.seconds.values()))
+    return tally, size, device.device_kind
+
+
+def _device(name: str):
+    """The JAX device that ``name`` means here."""
+    import jax
+
+    try:
+        return jax.devices(None if name == "auto" else name)[0]
+    except RuntimeError as error:
+        raise InputError(
+            f"device {name}: JAX sees none here; pip install 'mjx-refine[warp]' on a machine with an NVIDIA GPU, or choose "
+            "--device cpu"
+        ) from error
