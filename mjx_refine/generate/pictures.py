@@ -87,9 +87,7 @@ class _Work:
 
 def draw_clips(clips: Sequence[Clip]) -> list[Pictures]:
     """Masks and flow of every clip."""
-    return [
-        picture for part in _parts(clips) for picture in _draw_part(part)
-    ]  # a list, since the parts' arrays are large
+    return [picture for part in _parts(clips) for picture in _draw_part(part)]
 
 
 def _parts(clips: Sequence[Clip]) -> Iterator[list[Clip]]:
@@ -110,20 +108,43 @@ def _draw_part(clips: list[Clip]) -> list[Pictures]:
         where = _sort_tiles(clip, first, start, work)
         places.append((where, slice(start, start + len(where))))
         first, start = first + clip.qpos.shape[1], start + len(where)
-    ids, flow = np.zeros((start, SIDE * SIDE), np.uint8), np.zeros((start, 2, SIDE * SIDE), np.float16)
     frames = _prepared(clips)
     size = CHUNK.get(jax.default_backend(), CHUNK_ELSEWHERE)
-    drawn = [
-        (place, len(place), _cast_tiles(signature, frames, *arguments))
+    under_way = [
+        (place, _cast_tiles(signature, frames, *arguments))
         for signature, part in work.items()
         for place, arguments in _chunks(part, size)
-    ]  # all are under way before the first is waited for
-    for place, count, (some_ids, some_flow) in drawn:
-        ids[place], flow[place] = np.asarray(some_ids)[:count], np.asarray(some_flow)[:count]
+    ]  # all, before the first is waited for
+    drawn = _Drawn(
+        np.empty((start, SIDE * SIDE), np.uint8),
+        np.empty((start, 2 * SIDE * SIDE), np.float16),
+        np.empty(start, np.int32),
+    )
+    done = 0
+    for place, (some_ids, some_flow) in under_way:
+        here = slice(done, done + len(place))
+        drawn.ids[here] = np.asarray(some_ids)[: len(place)]
+        drawn.flow[here] = np.asarray(some_flow)[: len(place)]
+        drawn.row[place] = np.arange(here.start, here.stop)
+        done = here.stop
     return [
-        _gathered(where, ids[part], flow[part], clip.qpos.shape[1])
-        for clip, (where, part) in zip(clips, places, strict=True)
+        _gathered(where, drawn, part, clip.qpos.shape[1]) for clip, (where, part) in zip(clips, places, strict=True)
     ]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Drawn:
+    """Tiles as they came back.
+
+    Attributes:
+      ids: of every pixel.
+      flow: all x, then all y.
+      row: where in these a tile stands.
+    """
+
+    ids: UInt8[np.ndarray, "tiles samples"]
+    flow: Float16[np.ndarray, "tiles values"]
+    row: Int[np.ndarray, "tiles"]
 
 
 def _sort_tiles(clip: Clip, first: int, start: int, work: dict) -> Int[np.ndarray, "tiles 3"]:
@@ -221,8 +242,8 @@ def _cast_tiles(
     lead: Int[Array, "tiles"],
     corner: Int[Array, "tiles 2"],
     labels: Int[Array, "tiles labels"],
-) -> tuple[UInt8[Array, "tiles samples"], Float16[Array, "tiles 2 samples"]]:
-    """Numbers of objects and flow of every pixel of the tiles, row by row."""
+) -> tuple[UInt8[Array, "tiles samples"], Float16[Array, "tiles values"]]:
+    """Numbers of objects and flow (all x, then all y) of every pixel of the tiles, row by row."""
     each = {name: getattr(frames, name)[index][:, :, 0] for name in _OF_OBJECTS}
     part = Frames(**each, **{name: getattr(frames, name)[lead] for name in _OF_CAMERAS})
     line, column = jnp.meshgrid(jnp.arange(SIDE), jnp.arange(SIDE), indexing="ij")
@@ -231,44 +252,49 @@ def _cast_tiles(
     slots, flow_x, flow_y = cast(signature, part, x, y, (SIZE[0] / 2, SIZE[1] / 2))
     ids = jnp.take_along_axis(labels, slots, axis=1)
     flow = jnp.round(jnp.stack([flow_x, flow_y], 1) / FINEST) * FINEST
-    return ids.astype(jnp.uint8), flow.astype(jnp.float16)
+    return ids.astype(jnp.uint8), flow.astype(jnp.float16).reshape(len(index), -1)
 
 
 _OF_OBJECTS = ("ray", "origin", "size", "next_matrix", "next_offset")
 _OF_CAMERAS = ("down", "height", "focal")
 
 
-def _gathered(where: Int[np.ndarray, "tiles 3"], ids: np.ndarray, flow: np.ndarray, objects: int) -> Pictures:
+def _gathered(where: Int[np.ndarray, "tiles 3"], drawn: _Drawn, part: slice, objects: int) -> Pictures:
     """Runs and flow row by row, from tiles in the order of frame, row and column."""
-    time, row, column = where.T
+    rows = drawn.row[part]
+    ids = drawn.ids[rows]
+    hit = ids.any(1)
+    rows, ids, (time, row, column) = rows[hit], ids[hit], where[hit].T.astype(np.int32)
     band = time * GRID[0] + row
-    begins = np.concatenate([[True], band[1:] != band[:-1]]) if len(band) else np.zeros(0, bool)
-    number = np.cumsum(begins) - 1
-    start = np.nonzero(begins)[0]
-    length = np.diff(np.append(start, len(band)))[number]
+    start = np.flatnonzero(np.diff(band, prepend=-1))
+    length = np.diff(start, append=len(band))
+    rank = np.arange(len(band)) - np.repeat(start, length)
     # Line i of the tiles of a band stands before line i + 1 of any.
-    target = (SIDE * start[number] + np.arange(len(band)) - start[number])[:, None] + length[:, None] * np.arange(SIDE)
+    first = SIDE * np.repeat(start, length) + rank
+    target = first[:, None] + np.repeat(length, length)[:, None] * np.arange(SIDE)
     order = np.empty(target.size, np.int32)
     order[target.reshape(-1)] = np.arange(target.size, dtype=np.int32)
-    lines = ((band * SIDE)[:, None] + np.arange(SIDE)) * SIZE[0] + (column * SIDE)[:, None]
-    inside = np.flatnonzero(ids.reshape(-1, SIDE)[order])
-    line, beside = order[inside >> 3], (inside & 7).astype(np.int32)
-    pixel = lines.astype(np.int32).reshape(-1)[line] + beside
-    source = (line >> 3) * SIDE * SIDE + (line & 7) * SIDE + beside
-    shown = ids.reshape(-1)[source]
-    moving = int(np.searchsorted(pixel, (FRAMES - 1) * SIZE[0] * SIZE[1]))
-    source = source[:moving] + (line[:moving] >> 3) * SIDE * SIDE  # two planes of flow a tile
-    values = np.stack([flow.reshape(-1)[source], flow.reshape(-1)[source + SIDE * SIDE]])
+    lines = ((band * SIDE)[:, None] + np.arange(SIDE, dtype=np.int32)) * SIZE[0] + (column * SIDE)[:, None]
+    pixel, shown = lines.reshape(-1)[order], ids.reshape(-1, SIDE)[order].reshape(-1)
+    moving = SIDE * int(np.searchsorted(pixel, (FRAMES - 1) * SIZE[0] * SIZE[1]))
+    source = (rows[:, None] * (2 * SIDE) + np.arange(SIDE, dtype=np.int32)).reshape(-1)[order[: moving // SIDE]]
+    flow = drawn.flow.reshape(-1, SIDE)
+    inside = shown[:moving] > 0
+    values = np.stack([flow[source + k * SIDE].reshape(-1)[inside] for k in range(2)])
     return Pictures(_runs(pixel, shown), values, np.bincount(shown, minlength=objects + 1)[1:])
 
 
-def _runs(pixel: Int[np.ndarray, "pixels"], shown: UInt8[np.ndarray, "pixels"]) -> Int[np.ndarray, "3 runs"]:
-    if not len(pixel):
-        return np.zeros((3, 0), np.int32)
-    begins = np.concatenate([[True], (np.diff(pixel) != 1) | (shown[1:] != shown[:-1])])
-    start = np.nonzero(begins)[0]
-    length = np.diff(np.append(start, len(pixel)))
-    gap = pixel[start] - np.concatenate([[0], (pixel[start] + length)[:-1]])
+def _runs(pixel: Int[np.ndarray, "lines"], shown: UInt8[np.ndarray, "samples"]) -> Int[np.ndarray, "3 runs"]:
+    """Runs from lines of ``SIDE`` pixels: the number of each one's first pixel, and what all of them show."""
+    edge = np.zeros(len(shown), bool)
+    edge[::SIDE] = np.diff(pixel, prepend=-2 * SIDE) != SIDE
+    edge[1:] |= shown[1:] != shown[:-1]
+    start = np.flatnonzero(edge)
+    length = np.diff(start, append=len(shown))
+    seen = shown[start] > 0
+    start, length = start[seen], length[seen]
+    begin = pixel[start // SIDE] + start % SIDE
+    gap = begin - np.concatenate([[0], (begin + length)[:-1]])[: len(begin)]
     return np.stack([gap, length, shown[start]]).astype(np.int32)
 
 

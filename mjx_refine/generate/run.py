@@ -78,7 +78,8 @@ def generate_scenes(
       count: how many records, over all machines.
       out: folder.
       options: what to generate.
-      workers: processes; None: as many as there are cores.
+      workers: processes, each of one thread; None: as many as there are cores; 0: none but this one, whose renderer is
+        the one with which MuJoCo was imported.
       shard: (i, n): the i-th of n machines, from 1, writes every n-th shard.
       resume: keep whole shards of the same options, also of a smaller count.
       device: where pictures are drawn: ``auto`` (a GPU where JAX sees one), ``cpu``, ``gpu``; physics is C MuJoCo's.
@@ -96,7 +97,7 @@ def generate_scenes(
     for told in kept:
         tally.add(tally_of(told))
         size += told["bytes"]
-    processes = _workers(workers, len(jobs.left), options)
+    processes = _workers(workers, len(jobs.left))
     with _folder(out, alone=shard[1] == 1):
         try:
             for part, written, kind in worked(jobs.left, processes):
@@ -193,10 +194,10 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _workers(workers: int | None, jobs: int, options: GenerateOptions) -> int:
+def _workers(workers: int | None, jobs: int) -> int:
     """How many processes; 0: this one."""
+    if workers == 0:
+        return 0
     if workers is not None and not 1 <= workers <= 4096:
-        raise InputError(f"{workers} workers; expected 1 to 4096")
-    wanted = max(1, min(workers or cores(), jobs))
-    # A renderer is chosen when MuJoCo is imported, which this process has done.
-    return wanted if wanted > 1 or options.rgb else 0
+        raise InputError(f"{workers} workers; expected 0 (none but this process) to 4096")
+    return max(1, min(workers or cores(), jobs))
