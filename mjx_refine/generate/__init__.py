@@ -1,5 +1,6 @@
 """Synthetic training data as Δynamics (CVPR 2026) has it: random scenes, simulated, filtered, drawn, written as shards."""
 
+from mjx_refine.generate.make import replayed
 from mjx_refine.generate.options import HELD_OUT, SPLITS, GenerateOptions
 from mjx_refine.generate.record import Record, Seen
 from mjx_refine.generate.run import GenerateProgress, Summary, generate_scenes
@@ -15,5 +16,6 @@ __all__ = [
     "Summary",
     "generate_scenes",
     "read_records",
+    "replayed",
     "unpack",
 ]

@@ -18,7 +18,7 @@ from mjx_refine.generate.pictures import Clip, Pictures, draw_clips
 from mjx_refine.generate.record import Record, members
 from mjx_refine.generate.sample import Proposal, propose
 from mjx_refine.generate.tiles import bounding_boxes, nearest
-from mjx_refine.scene import Shape, dump_scene
+from mjx_refine.scene import Scene, Shape, dump_scene
 
 FILTERS = ("overlap", "diverged", "camera", "outside", "pixels")
 """In the order in which they are asked: two objects overlap at the start by MuJoCo's collision detection; the simulation
@@ -207,3 +207,10 @@ def _rejected(motion: Motion, batch: SceneBatch, row: int) -> str | None:
     if np.count_nonzero(~boxes.seen) > 1:
         return "outside"
     return "pixels" if boxes.pixels.sum(0).min() < LEAST_PIXELS else None
+
+
+def replayed(scene: Scene) -> tuple[Motion, Pictures]:
+    """Simulates and draws a record's scene again; on one kind of machine nothing differs from the record."""
+    batch = batch_from_scenes([scene])
+    motion = RecordingSimulator(scene.shapes).record(batch)[0]
+    return motion, draw_clips([Clip(motion.qpos, batch, 0)])[0]

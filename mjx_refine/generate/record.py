@@ -3,8 +3,9 @@
 A record's members share a key and differ in what follows its first dot, as WebDataset has it:
 
 ``KEY.yaml``          the scene, as every command reads it.
-``KEY.pictures.npz``  ``shape`` (T, H, W), ``fps``; ``runs`` (3, R) as ``Pictures.runs``; ``flow`` (2, M) uint16: the
-                      differences between the bit patterns of neighbours in ``Pictures.flow`` (float16), which deflate halves.
+``KEY.pictures.npz``  ``shape`` (T, H, W), ``fps``; ``runs`` (3, R) as ``Pictures.runs``; ``flow`` (2, 2, M) uint8: low and
+                      high bytes of the differences between the bit patterns of neighbours in ``Pictures.flow`` (float16),
+                      which deflate to less than half.
 ``KEY.motion.npz``    ``qpos`` (T, N, 7), ``qvel`` (T, N, 6), and ``contact_`` ``step``, ``pair``, ``points``, ``force``,
                       ``position`` as in ``Contacts``.
 ``KEY.rgb.jpg``       on request: the T frames one below the other.
@@ -111,16 +112,34 @@ def members(record: Record) -> dict[str, bytes]:
     """Contents of the record's files by what follows the key; equal records give equal bytes."""
     contacts = {f"contact_{name}": getattr(record.motion.contacts, name) for name in _CONTACTS}
     shape = np.array([FRAMES, SIZE[1], SIZE[0]], np.int32)
-    bits = np.diff(record.pictures.flow.view(np.uint16), axis=1, prepend=np.uint16(0))
     told = {
         "yaml": record.text.encode(),
-        PICTURES: packed({"shape": shape, "fps": np.float64(FPS), "runs": record.pictures.runs, "flow": bits}),
+        PICTURES: packed(
+            {
+                "shape": shape,
+                "fps": np.float64(FPS),
+                "runs": record.pictures.runs,
+                "flow": differences(record.pictures.flow),
+            }
+        ),
         MOTION: packed({"qpos": record.motion.qpos, "qvel": record.motion.qvel, **contacts}),
     }
     if record.seen is not None:
         told[RGB] = jpeg(record.seen.frames)
         told[MEASURED] = packed({"flow": record.seen.flow, "flow_sigma": record.seen.sigma})
     return told
+
+
+def differences(flow: Float16[np.ndarray, "2 pixels"]) -> UInt8[np.ndarray, "2 2 pixels"]:
+    """Low and high bytes of what the bit patterns of neighbours differ by."""
+    bits = np.diff(flow.view(np.uint16), axis=1, prepend=np.uint16(0)).astype("<u2")
+    return np.ascontiguousarray(bits.view(np.uint8).reshape(2, -1, 2).transpose(2, 0, 1))
+
+
+def summed(parts: UInt8[np.ndarray, "2 2 pixels"]) -> Float16[np.ndarray, "2 pixels"]:
+    """The flow of which these are the ``differences``."""
+    bits = parts[0] | parts[1].astype(np.uint16) << 8
+    return np.cumsum(bits, axis=1, dtype=np.uint16).view(np.float16)
 
 
 def packed(arrays: Mapping[str, ArrayLike]) -> bytes:
@@ -164,8 +183,7 @@ def from_members(key: str, contents: Mapping[str, bytes], source: str) -> Record
     place = f"{source}: record {key}"
     try:
         pictures, motion = (_unpacked(contents[name]) for name in (PICTURES, MOTION))
-        flow = np.cumsum(pictures["flow"], axis=1, dtype=np.uint16).view(np.float16)
-        runs = pictures["runs"]
+        flow, runs = summed(pictures["flow"]), pictures["runs"]
         if tuple(pictures["shape"]) != (FRAMES, SIZE[1], SIZE[0]):
             raise ValueError(f"pictures of shape {pictures['shape'].tolist()}")
         seen = None
