@@ -54,13 +54,31 @@ def make(count: int, seed: int, out: Path, bpy: str) -> None:
 
 
 @main.command()
+@click.option("--count", type=click.IntRange(1, 9999), default=2, show_default=True)
+@_SEED
+@_OUT
+@_BPY
+def clevrer(count: int, seed: int, out: Path, bpy: str) -> None:
+    """Instead: videos of five seconds in CLEVRER's format, for `python -m benchmarks.clevrer`."""
+    from benchmarks.blender.clevrer import make_video
+    from benchmarks.blender.studio import Studio
+
+    with Studio(bpy) as studio:
+        for number in range(count):
+            start = time.perf_counter()
+            said = make_video(studio, seed, number, out)
+            click.echo(f"{said}, {time.perf_counter() - start:.0f} s")
+
+
+@main.command()
 @_SET
 @_PROCESSES
 def observe(folder: Path, processes: int) -> None:
     """Measures the flow of every clip by OpenCV: flows.npz."""
     from benchmarks.blender import folders
+    from benchmarks.processes import each
 
-    for name in folders.each(folders.observe, folders.clip_folders(folder), processes):
+    for name in each(folders.observe, folders.clip_folders(folder), processes):
         click.echo(name)
 
 
@@ -70,8 +88,9 @@ def observe(folder: Path, processes: int) -> None:
 def guess(folder: Path, processes: int) -> None:
     """Makes 32 samples of every clip from its observation alone: guess.yaml."""
     from benchmarks.blender import folders
+    from benchmarks.processes import each
 
-    for name in folders.each(folders.guess, folders.clip_folders(folder), processes):
+    for name in each(folders.guess, folders.clip_folders(folder), processes):
         click.echo(name)
 
 
@@ -84,7 +103,7 @@ def guess(folder: Path, processes: int) -> None:
 @click.option("--iterations", type=click.IntRange(1, 100000), default=100, show_default=True)
 @click.option("--only", default="", help="Names of clips, with commas.")
 @click.option("--workers", type=click.IntRange(1, 4096), help="By default one a core.")
-def refine(folder: Path, out: Path, samples: str, only: str, workers: int | None, **options) -> None:
+def refine(folder: Path, out: Path, samples: str, only: str, workers: int | None, **options) -> int:
     """Refines every clip with C MuJoCo, as `refine --jobs … --resume` does; finished ones are left alone."""
     from benchmarks.blender.folders import jobs
     from mjx_refine import Options, refine_many
@@ -104,12 +123,19 @@ def refine(folder: Path, out: Path, samples: str, only: str, workers: int | None
     many = refine_many(
         chosen, Options(backend="mujoco", **options), out=out, workers=workers, resume=True, progress=Told()
     )
-    sys.exit(many.status)
+    return many.status
+
+
+def run(arguments: list[str] | None = None) -> int:
+    """The command; its exit status: 0 done, 2 wrong input, with one line on standard error, 1 what `refine` says."""
+    try:
+        status = main(arguments, prog_name="python -m benchmarks.blender", standalone_mode=False)
+        return status if isinstance(status, int) else 0
+    except (InputError, click.ClickException) as wrong:
+        said = wrong.format_message() if isinstance(wrong, click.ClickException) else str(wrong)
+        click.echo("blender: " + " ".join(said.split()), err=True)
+        return 2
 
 
 if __name__ == "__main__":
-    try:
-        main(standalone_mode=True)
-    except InputError as wrong:
-        click.echo(f"blender: {wrong}", err=True)
-        sys.exit(2)
+    sys.exit(run())

@@ -124,8 +124,9 @@ def collisions(
     objects: list[dict[str, Any]],
     position: Float[np.ndarray, "steps objects 3"],
     quaternion: Float[np.ndarray, "steps objects 4"],
+    rate: int = RATE,
 ) -> list[tuple[int, int, float]]:
-    """(object, object, seconds) of each moment when two bodies come to touch; RATE steps a second."""
+    """(object, object, seconds) of each moment when two bodies come to touch; `rate` steps a second."""
     entries = [*objects, {"type": "gravity", "gravity": [0, 0, 0]}]
     model, data = reference.build(entries, FPS)
     reach = [rotation.bounding_radius(entry) for entry in objects]
@@ -140,6 +141,6 @@ def collisions(
                 mujoco.mj_kinematics(model, data)
                 near = mujoco.mj_geomDistance(model, data, i + 1, j + 1, 1.0, None) < (2 * TOUCH if touching else TOUCH)
             if near and not touching:
-                found.append((i, j, step / RATE))
+                found.append((i, j, step / rate))
             touching = near
     return sorted(found, key=lambda meeting: meeting[2])

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -143,15 +141,6 @@ def guess(folder: Path) -> str:
     if not path.exists():
         save_scenes(path, guess_scenes(load_observation(folder / "flows.npz"), 32, 0))
     return folder.name
-
-
-def each(work: Callable[[Path], str], folders: list[Path], processes: int) -> Iterable[str]:
-    """Does the work for all folders; yields names as they are done, in order."""
-    if processes == 1:
-        yield from map(work, folders)
-        return
-    with ProcessPoolExecutor(processes) as pool:
-        yield from pool.map(work, folders)
 
 
 def jobs(root: Path, samples: str) -> list[Job]:

@@ -100,26 +100,27 @@ def draw_scene(rng: np.random.Generator, objects: int, size: tuple[int, int] = (
     pitch = float(rng.uniform(44, 56))
     camera = Camera((0.0, -2.0, float(rng.uniform(2.2, 3.2))), pitch, float(rng.uniform(36, 46)), *size)
     entries: list[Entry] = []
-    looks = _looks(rng, objects)
+    looks = looks_of(rng, objects)
     restitution = [float(rng.uniform(0.2, 0.7)) for _ in looks]
-    shapes = [_shape(rng) for _ in looks]
-    places = _places(rng, camera, shapes)
+    shapes = [shape_of(rng) for _ in looks]
+    places = places_of(rng, camera, shapes)
     for i, (shape, place) in enumerate(zip(shapes, places, strict=True)):
         moves = i == 0 or rng.random() < 0.5
-        aim = _aim(rng, camera, places, i)
-        entries.append(_entry(rng, shape, place, aim if moves else None, looks[i], restitution[i], i))
+        aim = aimed(rng, camera, places, i)
+        entries.append(entry_of(rng, shape, place, aim if moves else None, looks[i], restitution[i], i))
     entries.append({"type": "camera", "fovy": camera.fovy, "orientation": pitch, "position": list(camera.position)})
     entries.append({"type": "gravity", "gravity": [0.0, 0.0, -9.81]})
-    return Drawn(entries, looks, restitution, _light(rng))
+    return Drawn(entries, looks, restitution, light_of(rng))
 
 
-def _looks(rng: np.random.Generator, count: int) -> list[Look]:
+def looks_of(rng: np.random.Generator, count: int) -> list[Look]:
     """No two alike, as in CLEVRER."""
     every = [Look(colour, material) for colour in COLOURS for material in MATERIALS]
     return [every[i] for i in rng.choice(len(every), count, replace=False)]
 
 
-def _shape(rng: np.random.Generator) -> Entry:
+def shape_of(rng: np.random.Generator) -> Entry:
+    """A random sphere, cube or cylinder, 0.16 to 0.24 m in half size."""
     kind, half = str(rng.choice(["sphere", "box", "cylinder"])), float(rng.uniform(0.16, 0.24))
     if kind == "sphere":
         return {"type": kind, "radius": half}
@@ -128,7 +129,7 @@ def _shape(rng: np.random.Generator) -> Entry:
     return {"type": kind, "radius": 0.9 * half, "height": 1.8 * half}
 
 
-def _places(rng: np.random.Generator, camera: Camera, shapes: list[Entry]) -> list[Float[np.ndarray, "2"]]:
+def places_of(rng: np.random.Generator, camera: Camera, shapes: list[Entry]) -> list[Float[np.ndarray, "2"]]:
     """Spots on the floor, in view and apart."""
     found: list[np.ndarray] = []
     for _ in range(500):
@@ -149,7 +150,7 @@ def _places(rng: np.random.Generator, camera: Camera, shapes: list[Entry]) -> li
     return found
 
 
-def _aim(rng: np.random.Generator, camera: Camera, places: list[np.ndarray], index: int) -> Float[np.ndarray, "2"]:
+def aimed(rng: np.random.Generator, camera: Camera, places: list[np.ndarray], index: int) -> Float[np.ndarray, "2"]:
     """Another object, more or less, or some spot in view."""
     others = [place for i, place in enumerate(places) if i != index]
     if others and rng.random() < 0.8:
@@ -160,7 +161,7 @@ def _aim(rng: np.random.Generator, camera: Camera, places: list[np.ndarray], ind
     return camera.on_plane(image, 0.2)[:2]
 
 
-def _entry(
+def entry_of(
     rng: np.random.Generator,
     shape: Entry,
     place: Float[np.ndarray, "2"],
@@ -169,6 +170,7 @@ def _entry(
     restitution: float,
     index: int,
 ) -> Entry:
+    """The entry of a body on the floor at `place`, on its way to `aim` (m; None: at rest)."""
     kind, yaw = shape["type"], rotation.about(UP, rng.uniform(-np.pi, np.pi))
     way = np.zeros(3) if aim is None else np.array([*(aim - place), 0.0])
     distance = float(np.linalg.norm(way))
@@ -204,7 +206,8 @@ def _entry(
     }
 
 
-def _light(rng: np.random.Generator) -> dict[str, Any]:
+def light_of(rng: np.random.Generator) -> dict[str, Any]:
+    """Sun, sky and floor of a random stage."""
     turn, grey = rng.uniform(-np.pi, np.pi), float(rng.uniform(0.3, 0.5))
     return {
         "way": [float(0.6 * np.cos(turn)), float(0.6 * np.sin(turn)), -1.0],

@@ -79,13 +79,13 @@ class Studio:
         self.version = answer["blender"]
 
     def simulate(
-        self, bodies: list[dict[str, Any]], gravity: float, seconds: float
+        self, bodies: list[dict[str, Any]], gravity: float, seconds: float, rate: int = RATE
     ) -> tuple[Float[np.ndarray, "steps bodies 3"], Float[np.ndarray, "steps bodies 4"]]:
-        """Positions [m] and quaternions (w x y z) at RATE steps a second, from time 0 on."""
+        """Positions [m] and quaternions (w x y z) at `rate` steps a second, from time 0 on."""
         out = Path(self._folder.name) / "motion.npz"
-        steps = int(np.ceil(seconds * RATE))
+        steps = int(np.ceil(seconds * rate))
         self._ask(
-            {"do": "simulate", "bodies": bodies, "gravity": gravity, "rate": RATE, "steps": steps, "out": str(out)}
+            {"do": "simulate", "bodies": bodies, "gravity": gravity, "rate": rate, "steps": steps, "out": str(out)}
         )
         with np.load(out, allow_pickle=False) as data:
             return data["position"], data["quaternion"]
