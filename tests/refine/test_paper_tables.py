@@ -148,7 +148,7 @@ def test_evaluation_agrees_with_plain_numpy(sets, capsys):
         assert np.allclose(got[1:], list(expected(count).values()), atol=2e-3)
     assert expected(3)["iou"] > expected(1)["iou"] + 0.1
     assert rows["guess, Best@1"][1] == "0.500"
-    lines = list(csv.DictReader((sets / "table.csv").open()))
+    lines = list(csv.DictReader((sets / "table.csv").read_text().splitlines()))
     assert [(line["predictor"], line["clip"], line["best_at"]) for line in lines[:3]] == [
         ("guess", "one", "1"),
         ("guess", "two", "1"),
