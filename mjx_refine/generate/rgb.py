@@ -18,8 +18,11 @@ from mjx_refine.sim.model import apply_fields, build_spec, model_fields
 _STREAM = 2**32
 """Part of the looks' seed, away from all attempts."""
 
-_FINEST = 1 / 64
-"""Measured flow is rounded to this [px], half of the least noise that is ever stated."""
+_FINEST = 1 / 32
+"""Measured flow and its noise are rounded to this [px], the least noise that is ever stated."""
+
+_EXTENT = 5.0
+"""Half the width of what directional lights throw shadows in [m]."""
 
 _TEXTURE = 256
 """Pixels along a texture's edge."""
@@ -57,8 +60,8 @@ def film(record: Record, options: GenerateOptions, index: int) -> Seen:
     generator = np.random.default_rng((options.seed, SPLITS.index(options.split), index, _STREAM))
     frames = from_jpeg(jpeg(rendered(record.scene, record.motion.qpos, generator)))
     field = measure_flow(frames, record.masks.astype(np.int32))
-    flow = np.round(field.flow / _FINEST) * _FINEST
-    return Seen(frames, flow.astype(np.float16), np.maximum(field.sigma, _FINEST).astype(np.float16))
+    flow, sigma = (np.round(array / _FINEST) * _FINEST for array in (field.flow, field.sigma))
+    return Seen(frames, flow.astype(np.float16), np.maximum(sigma, _FINEST).astype(np.float16))
 
 
 def rendered(
@@ -71,7 +74,7 @@ def rendered(
     _dress(spec, scene, generator)
     model = spec.compile()
     apply_fields(model, model_fields(batch), 0)
-    model.stat.extent = 1.0
+    model.stat.extent = _EXTENT
     data = mujoco.MjData(model)
     frames = np.empty((len(qpos), SIZE[1], SIZE[0], 3), np.uint8)
     with mujoco.Renderer(model, SIZE[1], SIZE[0]) as renderer:
@@ -91,8 +94,8 @@ def _add_camera(spec: mujoco.MjSpec, scene: Scene) -> None:
     spec.worldbody.add_camera(name="view", pos=scene.camera.position, fovy=scene.camera.fovy, quat=quaternion)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = SIZE
     spec.visual.quality.numslices, spec.visual.quality.numstacks = 64, 32
-    spec.visual.quality.shadowsize = 2048
-    spec.visual.map.znear, spec.visual.map.zfar = 0.02, 60.0
+    spec.visual.quality.shadowsize = 4096
+    spec.visual.map.znear, spec.visual.map.zfar = 0.02 / _EXTENT, 60.0 / _EXTENT
 
 
 def _dress(spec: mujoco.MjSpec, scene: Scene, generator: np.random.Generator) -> None:
@@ -147,7 +150,7 @@ def _lights(spec: mujoco.MjSpec, scene: Scene, generator: np.random.Generator) -
     middle = np.mean([body.position for body in scene.objects], 0) * [1, 1, 0]
     count = int(generator.integers(1, 4))
     for number in range(count):
-        place = middle + generator.uniform([-3, -3, 3], [3, 3, 6])
+        place = middle + generator.uniform([-2, -2, 4], [2, 2, 7])
         strength = generator.uniform(0.4, 0.9, 1) * generator.uniform(0.8, 1.0, 3) / count**0.5
         spec.worldbody.add_light(
             pos=place, dir=middle - place, castshadow=number == 0, diffuse=strength, specular=0.4 * strength,
