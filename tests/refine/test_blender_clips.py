@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -201,6 +203,21 @@ def test_commands_on_a_set(made, tmp_path, capsys):
     with pytest.raises(InputError, match=r"guess\.yaml: not there yet"):
         folders.jobs(made, "guess")
     assert not out.exists()
+
+
+def test_only_making_needs_blender_and_pybullet(made):
+    code = (
+        "import sys; sys.modules.update(pybullet=None, bpy=None)\n"
+        "from benchmarks.blender.__main__ import run\n"
+        "import benchmarks.paper_tables\n"
+        "sys.exit(run(sys.argv[1:]))"
+    )
+    call = [sys.executable, "-c", code, "refine", str(made), "--out", str(made / "out"), "--samples", "guess"]
+    done = subprocess.run(
+        call, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    )
+    assert done.returncode == 2
+    assert "not there yet" in done.stderr
 
 
 @pytest.mark.parametrize(
