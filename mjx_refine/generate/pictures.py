@@ -20,7 +20,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.generate.options import FRAMES, SIZE
 from mjx_refine.generate.tiles import GRID, SIDE, bounding_boxes
 from mjx_refine.scene import SHAPES, Shape
-from mjx_refine.view.frames import Frames, make_frames
+from mjx_refine.view.frames import Frames, frames_of_batch
 from mjx_refine.view.rays import cast
 
 CAPACITY = 256
@@ -213,25 +213,29 @@ def _chunks(part: _Work, size: int) -> Iterator[tuple[np.ndarray, tuple[np.ndarr
 
 
 def _prepared(clips: list[Clip]) -> Frames:
-    """Ray-casting coefficients of every object and frame, each object as a scene of its own."""
-    poses = np.zeros((CAPACITY, FRAMES, 1, 7), np.float32)
-    poses[..., 2], poses[..., 3] = -1e3, 1.0
-    size, position = np.zeros((CAPACITY, 1, 3), np.float32), np.zeros((CAPACITY, 3), np.float32)
-    pitch, fovy = np.zeros(CAPACITY, np.float32), np.ones(CAPACITY, np.float32)
-    first = 0
-    for clip in clips:
-        mine = slice(first, first + clip.qpos.shape[1])
-        poses[mine, :, 0] = clip.qpos.swapaxes(0, 1)
-        size[mine, 0] = clip.batch.size[clip.row]
-        position[mine], pitch[mine] = clip.batch.camera_position[clip.row], clip.batch.camera_pitch[clip.row]
-        fovy[mine] = clip.batch.camera_fovy[clip.row]
-        first = mine.stop
-    return _frames(poses, size, position, pitch, fovy)
+    """Ray-casting coefficients of every object and frame, one row each; the last object is one that nothing hits.
+
+    Each clip's are computed as ``picture.draw`` does, whole and on the CPU, so that both see the same numbers.
+    """
+    with jax.default_device(_cpu()):
+        each = [frames_of_batch(c.qpos[None], c.batch[c.row : c.row + 1], SIZE[1]) for c in clips]
+    whole = {}
+    for name in (*_OF_OBJECTS, *_OF_CAMERAS):
+        parts = [np.asarray(getattr(frames, name)) for frames in each]
+        if name in _OF_OBJECTS:
+            parts = [part.swapaxes(0, 1) for part in parts]
+        else:
+            parts = [np.repeat(part[None], c.qpos.shape[1], 0) for part, c in zip(parts, clips, strict=True)]
+        told = np.concatenate(parts)
+        whole[name] = np.zeros((CAPACITY, *told.shape[1:]), np.float32)
+        whole[name][: len(told)] = told
+        whole[name] = whole[name].reshape(CAPACITY * FRAMES, *told.shape[2:])
+    return Frames(**whole)
 
 
-@jax.jit
-def _frames(poses, size, position, pitch, fovy) -> Frames:
-    return make_frames(poses, size, position, pitch, fovy, SIZE[1])
+@functools.cache
+def _cpu() -> jax.Device:
+    return jax.local_devices(backend="cpu")[0]
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -244,7 +248,7 @@ def _cast_tiles(
     labels: Int[Array, "tiles labels"],
 ) -> tuple[UInt8[Array, "tiles samples"], Float16[Array, "tiles values"]]:
     """Numbers of objects and flow (all x, then all y) of every pixel of the tiles, row by row."""
-    each = {name: getattr(frames, name)[index][:, :, 0] for name in _OF_OBJECTS}
+    each = {name: getattr(frames, name)[index] for name in _OF_OBJECTS}
     part = Frames(**each, **{name: getattr(frames, name)[lead] for name in _OF_CAMERAS})
     line, column = jnp.meshgrid(jnp.arange(SIDE), jnp.arange(SIDE), indexing="ij")
     x = (corner[:, 1, None] * SIDE + column.reshape(1, -1)).astype(jnp.float32) + 0.5
