@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -108,8 +109,8 @@ def _draw_part(clips: list[Clip]) -> list[Pictures]:
         where = _sort_tiles(clip, first, start, work)
         places.append((where, slice(start, start + len(where))))
         first, start = first + clip.qpos.shape[1], start + len(where)
-    frames = _prepared(clips)
-    size = CHUNK.get(jax.default_backend(), CHUNK_ELSEWHERE)
+    frames = jax.device_put(_prepared(clips))
+    size = CHUNK.get(_platform(), CHUNK_ELSEWHERE)
     under_way = [
         (place, _cast_tiles(signature, frames, *arguments))
         for signature, part in work.items()
@@ -234,8 +235,17 @@ def _prepared(clips: list[Clip]) -> Frames:
 
 
 @functools.cache
-def _cpu() -> jax.Device:
-    return jax.local_devices(backend="cpu")[0]
+def _cpu() -> Any:
+    """JAX's CPU; None, its own choice, where it was told to do without."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return None
+
+
+def _platform() -> str:
+    chosen = jax.config.jax_default_device
+    return getattr(chosen, "platform", None) or jax.default_backend()
 
 
 @functools.partial(jax.jit, static_argnums=0)
