@@ -27,8 +27,8 @@ import numpy as np
 
 from mjx_refine import GenerateOptions, InputError, Record, generate_scenes, parse_scenes, read_records
 from mjx_refine.compile_cache import enable_cache
-from mjx_refine.generate import replayed
-from mjx_refine.generate.run import Summary
+from mjx_refine.generate import GenerateProgress, Summary, replayed
+from mjx_refine.generate.run import cores
 from mjx_refine.simulate import simulate
 
 LEAST_IOU = 0.9999
@@ -51,6 +51,24 @@ def machine() -> str:
         f"{model}, {os.cpu_count()} cores; Python {platform.python_version()}, numpy {np.__version__}, "
         f"mujoco {mujoco.__version__}, jax {jax.__version__}"
     )
+
+
+class Watch(GenerateProgress):
+    """Remembers when shards were done."""
+
+    def __init__(self):
+        self.done: list[tuple[float, int]] = []
+
+    def update(self, records: int, total: int, tally) -> None:
+        """Another shard."""
+        self.done.append((time.perf_counter(), records))
+
+    def steady(self, workers: int) -> float | None:
+        """Scenes a second after every process has started up and written a shard; None: too few shards to tell."""
+        if len(self.done) < 4 * workers:
+            return None
+        (start, before), (end, after) = self.done[workers - 1], self.done[-1]
+        return (after - before) / (end - start)
 
 
 def report(summary: Summary) -> None:
@@ -81,14 +99,18 @@ def rate(arguments: argparse.Namespace) -> int:
         seed=arguments.seed, split=arguments.split, objects=arguments.objects, rgb=arguments.rgb,
         per_shard=arguments.per_shard,
     )  # fmt: skip
-    how = {"workers": arguments.workers, "device": arguments.device}
+    workers = arguments.workers or cores()
+    how, watch = {"workers": workers, "device": arguments.device}, Watch()
     with tempfile.TemporaryDirectory() as folder:
         if arguments.warm:
             generate_scenes(arguments.warm, Path(folder) / "warm", options, **how)
         out = arguments.out or Path(folder) / "out"
-        summary = generate_scenes(arguments.count, out, options, **how)
-        print(machine())
+        summary = generate_scenes(arguments.count, out, options, progress=watch, **how)
+        print(f"{machine()}; {workers} processes")
         report(summary)
+        steady = watch.steady(workers)
+        if steady is not None:
+            print(f"once all processes had started and written a shard: {steady:.1f} scenes/s")
     return 0
 
 
