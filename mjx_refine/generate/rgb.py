@@ -32,7 +32,7 @@ _KIND = mujoco.mjtTexture
 
 
 def check_renderer() -> None:
-    """Draws one small picture.
+    """Draws one small picture in this process.
 
     Raises:
       InputError: MuJoCo's renderer does not work here.

@@ -14,6 +14,7 @@ from mjx_refine import files
 from mjx_refine.errors import InputError
 from mjx_refine.generate.make import Tally
 from mjx_refine.generate.options import GenerateOptions
+from mjx_refine.generate.renderer import VARIABLE, choose_renderer
 from mjx_refine.generate.shards import finished, make_folder, tally_of, written_options
 from mjx_refine.generate.workers import Job, worked
 
@@ -98,9 +99,10 @@ def generate_scenes(
         tally.add(tally_of(told))
         size += told["bytes"]
     processes = _workers(workers, len(jobs.left))
-    with _folder(out, alone=shard[1] == 1):
+    environment = _environment(options, processes, device)
+    with _folder(out, alone=shard[1] == 1), contextlib.closing(worked(jobs.left, processes, environment)) as outcomes:
         try:
-            for part, written, kind in worked(jobs.left, processes):
+            for part, written, kind in outcomes:
                 tally.add(part)
                 made, size, drawn_on = made + part.records, size + written, kind
                 progress.update(tally.records, total, tally)
@@ -187,6 +189,22 @@ def _folder(out: Path, alone: bool) -> Iterator[None]:
             with contextlib.suppress(OSError):  # it holds something
                 folder.rmdir()
         raise
+
+
+def _environment(options: GenerateOptions, processes: int, device: str) -> dict[str, str]:
+    """What the workers' environment has beside this one's.
+
+    Raises:
+      InputError: no pictures can be drawn.
+    """
+    values = {"JAX_PLATFORMS": "cpu"} if device == "cpu" else {}
+    if options.rgb and processes:
+        values[VARIABLE] = choose_renderer()
+    elif options.rgb:
+        from mjx_refine.generate.rgb import check_renderer
+
+        check_renderer()
+    return values
 
 
 def cores() -> int:

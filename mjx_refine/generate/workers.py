@@ -10,7 +10,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
@@ -47,8 +47,8 @@ class Job:
     device: str
 
 
-def worked(jobs: list[Job], workers: int) -> Iterator[tuple[Tally, int, str]]:
-    """(tally, bytes, device) of every job, as they end, by so many processes; 0: by this one.
+def worked(jobs: list[Job], workers: int, environment: Mapping[str, str]) -> Generator[tuple[Tally, int, str]]:
+    """(tally, bytes, device) of every job, as they end, by so many processes with ``environment``; 0: by this one.
 
     Raises:
       InputError: a job cannot be done.
@@ -64,7 +64,7 @@ def worked(jobs: list[Job], workers: int) -> Iterator[tuple[Tally, int, str]]:
     context, beside = multiprocessing.get_context("spawn"), set(multiprocessing.active_children())
     pool = concurrent.futures.ProcessPoolExecutor(workers, context, _begin, (jobs[0],))
     try:
-        with _environment(jobs[0]):
+        with _environment({**ONE_THREAD, **environment}):
             futures = [pool.submit(_work, job) for job in jobs]
         for future in concurrent.futures.as_completed(futures):
             yield future.result()
@@ -84,13 +84,8 @@ def worked(jobs: list[Job], workers: int) -> Iterator[tuple[Tally, int, str]]:
 
 
 @contextlib.contextmanager
-def _environment(job: Job) -> Iterator[None]:
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
     """What worker processes inherit; what the user has set stays."""
-    values = dict(ONE_THREAD)
-    if job.options.rgb and "DISPLAY" not in os.environ:
-        values["MUJOCO_GL"] = "egl"
-    if job.device == "cpu":
-        values["JAX_PLATFORMS"] = "cpu"
     added = [name for name in values if name not in os.environ]
     os.environ.update({name: values[name] for name in added})
     try:
@@ -140,10 +135,6 @@ def _write(job: Job, maker: Maker) -> tuple[Tally, int, str]:
 
     enable_cache()
     device = _device(job.device)
-    if job.options.rgb:
-        from mjx_refine.generate.rgb import check_renderer
-
-        check_renderer()
     tally, first = Tally(), job.number * job.options.per_shard
     began = time.perf_counter()
     with jax.default_device(device):

@@ -358,6 +358,7 @@ def test_looks_compile_and_change_no_motion():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of contexts that could not be made
 def test_frames_masks_and_flow_agree(records):
     """Needs OpenGL: MUJOCO_GL=egl pytest -m slow."""
     try:

@@ -198,17 +198,20 @@ def test_an_out_that_cannot_be_written(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-@pytest.mark.parametrize("lacking", ["gpu", "renderer"])
+@pytest.mark.parametrize("lacking", ["gpu", "renderer", "library"])
 def test_what_the_machine_lacks_is_told(lacking, tmp_path, monkeypatch, capsys):
-    # Each worker asks JAX and MuJoCo, and so sees this environment.
+    # Processes apart ask JAX and MuJoCo, and so see this environment.
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-    monkeypatch.setenv("MUJOCO_GL", "disable")
+    if lacking == "renderer":
+        monkeypatch.setenv("MUJOCO_GL", "disable")
+    elif lacking == "library":  # importing MuJoCo fails
+        monkeypatch.setenv("MUJOCO_GL", "bogus")
     wanted = ["--device", "gpu"] if lacking == "gpu" else ["--rgb"]
     out = tmp_path / "deep" / "data"
     assert run(["generate", "--count", "2", "--out", str(out), "--workers", "1", *wanted]) == 2
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1
-    assert ("MUJOCO_GL=egl" if lacking == "renderer" else "--device cpu") in captured.err
+    assert ("--device cpu" if lacking == "gpu" else "MUJOCO_GL=egl") in captured.err
     assert not list(tmp_path.iterdir())
 
 
