@@ -34,11 +34,11 @@ from mjx_refine.batch import SceneBatch, batch_from_scenes
 from mjx_refine.files import write_text
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Body, Samples, Scene, load_scene
-from mjx_refine.search.landing import HORIZONS
 from mjx_refine.search.objective import Objective
 from mjx_refine.search.problem import Problem, Start
 from mjx_refine.search.progress import Progress
 from mjx_refine.search.run import Run
+from mjx_refine.search.schedule import HORIZONS
 from mjx_refine.space import Space
 
 METHODS = ("hybrid", "cmaes", "gradient", "pycma", "oracle")

@@ -14,7 +14,8 @@ from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Body, Scene
 from mjx_refine.search.features import flow_points, outlines
-from mjx_refine.search.landing import LeastSquares, stages
+from mjx_refine.search.landing import LeastSquares
+from mjx_refine.search.schedule import stages
 from mjx_refine.space import Space
 from mjx_refine.space.layout import lowest_extent
 from mjx_refine.view.tiles import foreground

@@ -14,7 +14,8 @@ from mjx_refine.guess.tracks import find_tracks
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene
 from mjx_refine.search.features import Outlines
-from mjx_refine.search.landing import LeastSquares, Stage
+from mjx_refine.search.landing import LeastSquares
+from mjx_refine.search.schedule import Stage
 from mjx_refine.sim.separate import separate
 from mjx_refine.space import Space
 

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.search.features import DIRECTIONS, POINTS, Outlines
+from mjx_refine.search.schedule import Stage
 from mjx_refine.space import Space
 from mjx_refine.view.seen import seen_point_flow, seen_supports
 
@@ -32,6 +33,12 @@ SCATTER = 256
 
 MISFIT = 1.5
 """Root mean square distance of outlines [px at a picture 480 wide] above which an object is said not to fit."""
+
+FITS = 1.5
+"""The same of one frame, above which its horizon is fitted by a stage of its own."""
+
+EARLY = 0.35
+"""Part of the clip whose horizons are never left out: outlines that fit there do not yet tell velocities and spins."""
 
 TURNS = ("yaw", "tilt", "lean")
 """Fields of the parameter space that turn an object at the start."""
@@ -48,26 +55,6 @@ NOISE_FLOOR = 0.5
 EDGE_WEIGHT = float(np.sqrt(6 / DIRECTIONS)) / NOISE_FLOOR
 MOTION_WEIGHT = float(np.sqrt(2 / POINTS)) / FLOW_NOISE
 """Of one direction of an outline, and of one coordinate of the flow at one point [1 / px at a picture 480 wide]."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Stage:
-    """Frames that count, scale of the robust loss [px at a picture 480 wide], most iterations."""
-
-    frames: int
-    scale: float
-    iterations: int
-
-
-HORIZONS = (0.1, 0.17, 0.24, 0.32, 0.41, 0.5, 0.6, 0.72, 0.86, 1.0)
-"""Parts of the clip, one after the other; small steps at first, while there is little to go by."""
-
-
-def stages(length: int) -> list[Stage]:
-    """The horizon from the first frame to the whole clip, the loss from forgiving to strict."""
-    horizons = sorted({1, *[min(length, max(2, round(length * part))) for part in HORIZONS]})
-    result = [Stage(h, 12.0 if h < length else 6.0, 3 if h < length else 8) for h in horizons]
-    return [*result, Stage(length, 2.0, 8)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,15 +219,24 @@ class LeastSquares:
         before = self.evaluations
         generator = np.random.default_rng(self.seed)
         point, jacobian, cost = start, np.zeros((0, len(start))), np.inf
-        for stage in schedule:
+        known = 0
+        for k, stage in enumerate(schedule):
             if self._spent:
                 break
+            if EARLY * len(self.target) < stage.frames <= known and stage.frames < len(self.target):
+                continue
+            slopes = hops > 0 or k == len(schedule) - 1
             if stage.frames > 1 and len(jacobian):
                 point, cost, jacobian = self._extend(point, jacobian, stage, hops, generator)
             else:
-                point, cost, jacobian = self._stage(point, stage)
+                point, cost, jacobian = self._stage(point, stage, slopes)
             if progress:
                 progress(stage, point)
+            if len(schedule) > 1:
+                known = self._fitting(point, stage.frames)
+        if cost < np.inf and not len(jacobian) and self.evaluations + len(start) < self.limit:
+            base, _ = self.residuals(point[None], schedule[-1].frames, schedule[-1].scale)
+            jacobian = self.jacobian(point, base[0], schedule[-1].frames, schedule[-1].scale)
         curvature = jacobian.T @ jacobian + np.eye(len(start))
         scale = self.space.sigma
         return Landing(
@@ -258,16 +254,30 @@ class LeastSquares:
         will do; derivatives end there. Objects that have not met move independently, and a rollout of all tells the cost
         of each: the best draw of every object that does not fit is combined into one point.
         """
-        best = self._stage(point, stage)
+        best = self._stage(point, stage, True)
         for _ in range(hops):
             misfit = self._misfit(best[0], stage)
             if not misfit.any() or self._spent:
                 break
             combined = self._combined(point, best[0], jacobian, misfit, stage, generator)
-            hop = self._stage(combined, stage)
+            hop = self._stage(combined, stage, True)
             if hop[1] < best[1]:
                 best = hop
         return best
+
+    def _fitting(self, point: np.ndarray, frames: int) -> int:
+        """Frames from the first on whose outlines fit, at least ``frames``: horizons among them need no stage.
+
+        Not of solvers that are not ours: they take one step length at a time, and need the shorter horizons.
+        """
+        length = len(self.target)
+        if frames >= length or self.solver != "lm":
+            return frames
+        raw = self.distances(point[None], length)[0][0]
+        seen = np.isfinite(raw).sum(2)
+        rms = np.sqrt(np.nansum(raw**2, 2) / np.maximum(seen, 1)).max(1)
+        wrong = np.nonzero(rms > FITS)[0]
+        return max(frames, int(wrong[0]) if len(wrong) else length)
 
     def _misfit(self, point: np.ndarray, stage: Stage) -> np.ndarray:
         raw = self.distances(point[None], stage.frames)[0][0]
@@ -299,8 +309,9 @@ class LeastSquares:
                 far[:, j] = generator.uniform(-1.0, 1.0, count) * min(1.6, parameter.high) / parameter.width
         return np.clip(point + np.concatenate([near, far]) * self.space.sigma, 0.0, 1.0)
 
-    def _stage(self, point: np.ndarray, stage: Stage) -> tuple[np.ndarray, float, np.ndarray]:
-        """One stage from ``point``: (point, cost, Jacobian; without rows where nothing was left for one)."""
+    def _stage(self, point: np.ndarray, stage: Stage, slopes: bool) -> tuple[np.ndarray, float, np.ndarray]:
+        """One stage from ``point``: (point, cost, Jacobian; without rows where nothing was left for one, or where it was
+        not asked for by ``slopes``)."""
         if self.solver != "lm":
             return self._others_stage(point, stage)
         sigma, start = self.space.sigma, self.space.start
@@ -309,10 +320,12 @@ class LeastSquares:
         base, cost = base[0], float(costs[0])
         if self._spent:
             return point, cost, np.zeros((0, len(point)))
-        jacobian = self.jacobian(point, base, stage.frames, stage.scale)
+        jacobian = None
         for _ in range(stage.iterations):
             if self._spent:
                 break
+            if jacobian is None:
+                jacobian = self.jacobian(point, base, stage.frames, stage.scale)
             gradient = jacobian.T @ base + (point - start) / sigma
             curvature = jacobian.T @ jacobian + np.eye(len(point))
             trials = []
@@ -329,10 +342,12 @@ class LeastSquares:
             gain = cost - float(costs[best])
             point, base, cost = trials[best], moved[best], float(costs[best])
             damping = float(np.clip(damping * DAMPINGS[best] / DAMPINGS[2], 1e-3, 1e3))
-            jacobian = self.jacobian(point, base, stage.frames, stage.scale)
+            jacobian = None
             if gain < 1e-3 * cost:
                 break
-        return point, cost, jacobian
+        if jacobian is None and slopes and not self._spent:
+            jacobian = self.jacobian(point, base, stage.frames, stage.scale)
+        return point, cost, np.zeros((0, len(point))) if jacobian is None else jacobian
 
     def _others_stage(self, point: np.ndarray, stage: Stage) -> tuple[np.ndarray, float, np.ndarray]:
         """One stage by a solver that is not ours."""

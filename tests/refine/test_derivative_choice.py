@@ -22,8 +22,9 @@ from mjx_refine.scene import Body, Camera, Scene
 from mjx_refine.search import Options, Progress, refine
 from mjx_refine.search.derivatives import LEAST_PARAMETERS, WORK, Automatic, _simulator, extent
 from mjx_refine.search.features import flow_points, outlines
-from mjx_refine.search.landing import LeastSquares, stages
+from mjx_refine.search.landing import LeastSquares
 from mjx_refine.search.options import DERIVATIVES
+from mjx_refine.search.schedule import stages
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.space import Space
 from mjx_refine.view.picture import draw

@@ -11,7 +11,8 @@ from own_clip import SCENES, SIZE, OwnClip, perturbed
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.search.features import DIRECTIONS, flow_points, outlines
-from mjx_refine.search.landing import LeastSquares, Stage, stages
+from mjx_refine.search.landing import LeastSquares
+from mjx_refine.search.schedule import Stage, stages
 from mjx_refine.space import Space
 from mjx_refine.view.outline import directions
 

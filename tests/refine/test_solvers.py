@@ -12,8 +12,9 @@ from scipy.optimize import lsq_linear
 from mjx_refine.cli import commands
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Scene
-from mjx_refine.search.landing import Landing, LeastSquares, Stage, stages
+from mjx_refine.search.landing import Landing, LeastSquares
 from mjx_refine.search.options import SOLVERS, Options
+from mjx_refine.search.schedule import Stage, stages
 from mjx_refine.search.solvers import STEPS, StageProblem, improve
 
 OTHERS = tuple(STEPS)
