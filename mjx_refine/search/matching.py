@@ -14,12 +14,26 @@ FIRST_FRAMES = 3
 """Frames in which object and mask are compared: a rough start goes wrong later."""
 
 
+def frames_to_match(seen: Outlines) -> int:
+    """Frames of a rollout that ``match_objects`` needs: more than ``FIRST_FRAMES`` where a mask appears late."""
+    return 1 + max(
+        (int(_first_seen(seen, j)[-1]) for j in range(len(seen.ids)) if len(_first_seen(seen, j))), default=0
+    )
+
+
+def _first_seen(seen: Outlines, j: int) -> np.ndarray:
+    return np.nonzero(np.isfinite(seen.centre[:, j, 0]))[0][:FIRST_FRAMES]
+
+
 def match_objects(
     poses: Float[np.ndarray, "frames objects 7"], batch: SceneBatch, row: int, seen: Outlines, image: tuple[int, int]
 ) -> tuple[int, ...]:
     """Assigns masks to objects by place and size in the first frames where each mask is seen (Hungarian).
 
     Outlines, not overlap, so that an object that starts beside its mask still finds it.
+
+    Args:
+      poses: of one candidate, at least ``frames_to_match`` frames.
 
     Returns:
       for each object its mask's id, or ``UNMATCHED``.
@@ -31,7 +45,7 @@ def match_objects(
     width = (reach[..., : DIRECTIONS // 2] + reach[..., DIRECTIONS // 2 :]).mean(-1)
     costs = np.full((poses.shape[1], len(seen.ids)), np.inf)
     for j in range(len(seen.ids)):
-        visible = np.nonzero(np.isfinite(seen.centre[:, j, 0]))[0][:FIRST_FRAMES]
+        visible = _first_seen(seen, j)
         if len(visible) == 0:
             continue
         extent = 2 * np.sqrt(np.maximum(seen.area[visible, j], 1.0) / np.pi)

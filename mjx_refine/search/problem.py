@@ -15,7 +15,7 @@ from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Samples, Scene, Shape
 from mjx_refine.search.features import Outlines, flow_points, outlines
-from mjx_refine.search.matching import match_objects
+from mjx_refine.search.matching import frames_to_match, match_objects
 from mjx_refine.search.options import Options
 from mjx_refine.sim.backends import backend_for
 from mjx_refine.sim.c import MujocoSimulator
@@ -117,7 +117,7 @@ class Problem:
             simulator = self.reference(shapes)
             separated = [_separated(self.samples.scenes[row], simulator) for row in rows]
             batch = batch_with_effects([scene for scene, _ in separated])
-            poses = self.as_seen(shapes).rollout(batch, min(3, self.observation.length))
+            poses = self.as_seen(shapes).rollout(batch, frames_to_match(self.seen))
             groups: dict[tuple[int, ...], list[int]] = defaultdict(list)
             for k in range(len(rows)):
                 groups[match_objects(poses[k], batch, k, self.seen, self.observation.size)].append(k)

@@ -245,6 +245,14 @@ def test_an_object_whose_mask_never_appears(clip, optimizer):
     assert sorted(result.matching) == [-1, 1]
 
 
+def test_an_object_whose_mask_appears_late_finds_it(clip):
+    masks = clip.masks.copy()
+    masks[:5][masks[:5] == 2] = 0
+    result = refine(SAMPLES, dataclasses.replace(clip, masks=masks), TINY)
+    check(result, TINY)
+    assert result.matching == (1, 2)
+
+
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
 def test_flow_that_was_never_measured(clip, optimizer):
     options = dataclasses.replace(TINY, optimizer=optimizer, iterations=12)
