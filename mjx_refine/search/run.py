@@ -16,7 +16,7 @@ from mjx_refine.scene import Scene
 from mjx_refine.search.checkpoint import damaged, input_digest, load_checkpoint, save_checkpoint
 from mjx_refine.search.derivatives import DerivativeChoice, Derivatives
 from mjx_refine.search.intervals import Intervals, intervals
-from mjx_refine.search.landed import LANDED_WELL, Landed, first_covariance
+from mjx_refine.search.landed import LANDED_WELL, PROBING, Landed, first_covariance, fitting_width, landed_well
 from mjx_refine.search.landing import LeastSquares
 from mjx_refine.search.objective import Objective
 from mjx_refine.search.problem import Problem, Start, kind_of_scene
@@ -36,18 +36,6 @@ LANDING_SHARE = 0.6
 GENERATIONS = 80
 """Generations for which the budget after a landing must suffice; the population shrinks, down to CMA-ES's default
 4 + 3 ln n (Hansen, The CMA Evolution Strategy: A Tutorial, 2023, table 1), until it does."""
-
-WIDTHS = np.array([1.0, 0.5, 0.25, 0.125])
-"""Of the first generation, in multiples of what the landing proposes: contacts may leave less room than derivatives say."""
-
-PROBES = 10
-"""Draws by which each is judged."""
-
-PROBING = 8
-"""Budgets, in multiples of what judging them takes, below which they are not judged."""
-
-LOSS = 0.006
-"""Fitness that half of the first generation's candidates may lose; from more they do not recover in time."""
 
 ELITES = 8
 """Candidates of the search that are compared at full resolution in the end."""
@@ -242,8 +230,9 @@ class Run:
         if self._saved is None:
             if left < population:
                 return "The budget of rollouts was spent by least squares.", []
-            if self.landed and left > PROBING * (len(WIDTHS) * PROBES + 1):
-                covariance = self._fitting_width(objective, mean, covariance) ** 2 * covariance
+            if landed_well(self.landed) and left > PROBING:
+                width, spent = fitting_width(lambda points: objective(points)[0], mean, covariance, self.options.seed)
+                covariance, self.evaluations = width**2 * covariance, self.evaluations + spent
             state = mjx_cmaes.init(settings, mean, covariance=covariance, seed=self.options.seed)
             elites, elite_costs = mean[None], np.full(1, np.inf)
         else:
@@ -272,17 +261,6 @@ class Run:
             self._saved = ({"best": self._best, "population": population}, arrays)
             self._save()
         return "The budget of rollouts is spent.", [np.clip(state.mean, 0, 1), *elites]
-
-    def _fitting_width(self, objective: Objective, mean: np.ndarray, covariance: np.ndarray) -> float:
-        """Factor on the first generation's standard deviations: the largest of ``WIDTHS`` that costs little."""
-        generator = np.random.default_rng([self.options.seed, 1])
-        steps = generator.standard_normal((PROBES // 2, len(mean))) @ np.linalg.cholesky(covariance).T
-        points = mean + np.multiply.outer(WIDTHS, np.concatenate([steps, -steps])).reshape(-1, len(mean))
-        costs, _ = objective(np.clip(np.concatenate([mean[None], points]), 0.0, 1.0))
-        self.evaluations += len(costs)
-        costs = np.where(np.isfinite(costs), costs, np.inf)
-        losses = np.median(costs[1:].reshape(len(WIDTHS), PROBES), axis=1) - costs[0]
-        return float(WIDTHS[np.append(np.nonzero(losses < LOSS)[0], len(WIDTHS) - 1)[0]])
 
     def _population(self, dimension: int, left: int) -> int:
         """Candidates a generation: after a landing, few enough for ``GENERATIONS`` with what is left."""
