@@ -25,6 +25,7 @@ from pathlib import Path
 import click
 import numpy as np
 
+from benchmarks.commands import exit_status
 from benchmarks.processes import each
 from mjx_refine.errors import InputError
 
@@ -276,13 +277,7 @@ def evaluation(truths: Path, predictions: tuple[str, ...], best: str, table: Pat
 
 def run(arguments: list[str] | None = None) -> int:
     """The command; its exit status: 0 done, 2 wrong input, with one line on standard error."""
-    try:
-        main(arguments, prog_name="python -m benchmarks.paper_tables", standalone_mode=False)
-        return 0
-    except (InputError, click.ClickException) as wrong:
-        said = wrong.format_message() if isinstance(wrong, click.ClickException) else str(wrong)
-        click.echo("paper_tables: " + " ".join(said.split()), err=True)
-        return 2
+    return exit_status(main, "paper_tables", arguments)
 
 
 if __name__ == "__main__":

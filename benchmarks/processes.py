@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import TypeVar
 
+from mjx_refine.children import ONE_THREAD, inherited
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-}
 
 
 def each(work: Callable[[Item], Result], items: Sequence[Item], processes: int) -> Iterator[Result]:
@@ -28,7 +23,5 @@ def each(work: Callable[[Item], Result], items: Sequence[Item], processes: int) 
     if processes <= 1:
         yield from map(work, items)
         return
-    for name, value in ONE_THREAD.items():
-        os.environ.setdefault(name, value)  # for the children
-    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+    with inherited(ONE_THREAD), ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
         yield from pool.map(work, items)

@@ -21,7 +21,7 @@ LAYERS = (
     {"files"},
     {"scene"},
     {"rotations"},
-    {"batch", "observation", "compile_cache"},
+    {"batch", "observation", "compile_cache", "children"},
     {"effects"},
     {"sim", "view", "space"},
     {"gradients"},

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import click
 
+from benchmarks.commands import exit_status
 from mjx_refine.errors import InputError
 
 _SET = click.argument("folder", type=click.Path(path_type=Path))
@@ -128,13 +129,7 @@ def refine(folder: Path, out: Path, samples: str, only: str, workers: int | None
 
 def run(arguments: list[str] | None = None) -> int:
     """The command; its exit status: 0 done, 2 wrong input, with one line on standard error, 1 what `refine` says."""
-    try:
-        status = main(arguments, prog_name="python -m benchmarks.blender", standalone_mode=False)
-        return status if isinstance(status, int) else 0
-    except (InputError, click.ClickException) as wrong:
-        said = wrong.format_message() if isinstance(wrong, click.ClickException) else str(wrong)
-        click.echo("blender: " + " ".join(said.split()), err=True)
-        return 2
+    return exit_status(main, "blender", arguments)
 
 
 if __name__ == "__main__":

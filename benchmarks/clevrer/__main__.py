@@ -17,6 +17,7 @@ from pathlib import Path
 
 import click
 
+from benchmarks.commands import exit_status
 from mjx_refine.errors import InputError
 
 _PATH = click.Path(path_type=Path)
@@ -110,13 +111,7 @@ def main(videos, proposals, annotations, out, numbers, seconds, fps, least_pixel
 
 def run(arguments: list[str] | None = None) -> int:
     """The command; its exit status: 0 done, 2 wrong input, with one line on standard error."""
-    try:
-        main(arguments, prog_name="python -m benchmarks.clevrer", standalone_mode=False)
-        return 0
-    except (InputError, click.ClickException) as wrong:
-        said = wrong.format_message() if isinstance(wrong, click.ClickException) else str(wrong)
-        click.echo("clevrer: " + " ".join(said.split()), err=True)
-        return 2
+    return exit_status(main, "clevrer", arguments)
 
 
 if __name__ == "__main__":

@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import concurrent.futures
-import contextlib
 import dataclasses
 import multiprocessing
 import os
 import signal
 import threading
 import time
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
+from mjx_refine.children import ONE_THREAD, exit_with_parent, inherited
 from mjx_refine.errors import InputError
 from mjx_refine.generate.make import Maker, Tally
 from mjx_refine.generate.options import GenerateOptions
 from mjx_refine.generate.shards import shard_name, write_shard
 
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-    "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
-}
+SHARED = {**ONE_THREAD, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
 """Environment of a worker: the processes share the cores, and a GPU's memory."""
 
 
@@ -64,7 +59,7 @@ def worked(jobs: list[Job], workers: int, environment: Mapping[str, str]) -> Gen
     context, beside = multiprocessing.get_context("spawn"), set(multiprocessing.active_children())
     pool = concurrent.futures.ProcessPoolExecutor(workers, context, _begin, (jobs[0],))
     try:
-        with _environment({**ONE_THREAD, **environment}):
+        with inherited({**SHARED, **environment}):
             futures = [pool.submit(_work, job) for job in jobs]
         for future in concurrent.futures.as_completed(futures):
             yield future.result()
@@ -83,18 +78,6 @@ def worked(jobs: list[Job], workers: int, environment: Mapping[str, str]) -> Gen
             process.join()
 
 
-@contextlib.contextmanager
-def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """What worker processes inherit; what the user has set stays."""
-    added = [name for name in values if name not in os.environ]
-    os.environ.update({name: values[name] for name in added})
-    try:
-        yield
-    finally:
-        for name in added:
-            os.environ.pop(name, None)
-
-
 _MAKERS: dict[GenerateOptions, Maker] = {}
 _AT_WORK: list[Job] = []
 
@@ -103,7 +86,7 @@ def _begin(job: Job) -> None:
     """Before a worker's first job."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends us
     signal.signal(signal.SIGTERM, lambda *_: _end())
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=exit_with_parent, args=(_end,), daemon=True).start()
     _MAKERS[job.options] = Maker(job.options)
 
 
@@ -113,13 +96,6 @@ def _end() -> None:
         for part in job.out.glob(f".{shard_name(job.options.split, job.number)}.*.part"):
             part.unlink(missing_ok=True)
     os._exit(1)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        _end()
 
 
 def _work(job: Job) -> tuple[Tally, int, str]:

@@ -9,17 +9,18 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
+from mjx_refine.children import ONE_THREAD, exit_with_parent, inherited
 from mjx_refine.errors import InputError
 from mjx_refine.many.groups import Kind, Waiting
 from mjx_refine.many.jobs import Job
 from mjx_refine.many.outcome import FAILED, Outcome
 from mjx_refine.many.progress import ManyProgress
-from mjx_refine.many.work import ONE_THREAD, work
+from mjx_refine.many.work import work
 from mjx_refine.search import Options
 from mjx_refine.sim.backends import resolve_backend
 
@@ -140,7 +141,7 @@ class _Worker:
         if beside > 1:
             options = dataclasses.replace(options, threads=options.threads or max(1, cores() // beside))
         self.process = context.Process(target=_serve, args=(theirs, out, options), daemon=True)
-        with _environment(ONE_THREAD if beside > 1 else {}):
+        with inherited(ONE_THREAD if beside > 1 else {}):
             self.process.start()
         theirs.close()
         self.job: Job | None = None
@@ -161,18 +162,6 @@ class _Worker:
         return _how(self.process.exitcode)
 
 
-@contextlib.contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    """This process's environment with ``values`` for a while, for a child to inherit; what the user has set stays."""
-    added = [name for name in values if name not in os.environ]
-    os.environ.update({name: values[name] for name in added})
-    try:
-        yield
-    finally:
-        for name in added:
-            os.environ.pop(name, None)
-
-
 def _how(code: int | None) -> str:
     if code is None or code >= 0:
         return f"exit status {code}"
@@ -186,7 +175,7 @@ def _how(code: int | None) -> str:
 def _serve(pipe: Any, out: Path, options: Options) -> None:
     """A worker process: a job in, its outcome out, until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends us
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=exit_with_parent, daemon=True).start()
     with contextlib.suppress(EOFError, OSError):
         try:
             pipe.send(("ready", resolve_backend(options.backend)))
@@ -195,11 +184,3 @@ def _serve(pipe: Any, out: Path, options: Options) -> None:
         while True:
             job = pipe.recv()
             pipe.send(("done", work(job, out, options, lambda part: pipe.send(("part", part)))))
-
-
-def _end_with_parent() -> None:
-    """A worker must not write on in a folder that a next call may be working in."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)

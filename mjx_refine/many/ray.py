@@ -11,12 +11,13 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
+from mjx_refine.children import ONE_THREAD
 from mjx_refine.errors import InputError
 from mjx_refine.many.groups import Kind
 from mjx_refine.many.jobs import Job
 from mjx_refine.many.outcome import FAILED, Outcome
 from mjx_refine.many.progress import ManyProgress
-from mjx_refine.many.work import ONE_THREAD, work
+from mjx_refine.many.work import work
 from mjx_refine.search import Options
 
 RETRIES = 3

@@ -27,15 +27,6 @@ SEARCHING = 0.8
 SECONDS = 0.5
 """Between two messages about a job's progress."""
 
-ONE_THREAD = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-}
-"""Environment of a process that computes with one thread, read when numpy is imported and JAX begins: several processes
-whose linear algebra has a thread for every core wait for one another ten times as long as they compute."""
-
 
 def work(job: Job, out: Path, common: Options, told: Callable[[float], object] = lambda part: None) -> Outcome:
     """Refines one job into its folder; goes on from its checkpoint, and leaves a finished result of the same input alone.

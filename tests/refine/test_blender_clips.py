@@ -24,9 +24,6 @@ from mjx_refine import load_observation
 from mjx_refine.errors import InputError
 from mjx_refine.scene import parse_scenes
 
-BPY = os.environ.get("BPY_PYTHON", "")
-needs_blender = pytest.mark.skipif(not BPY, reason="BPY_PYTHON names no Python that has bpy")
-
 
 def ball(place, velocity=(0.0, 0.0, 0.0), name="sphere_0", radius=0.2, friction=0.3):
     state = {
@@ -265,7 +262,7 @@ def test_annotated_motion():
     assert np.allclose(told["orientation"][10, 0], [0, 0, 3 * 10 / clevrer.FPS])
 
 
-@needs_blender
+@pytest.mark.blender
 def test_blender_simulates_and_draws():
     """A cube that slides as Coulomb says, the same twice; masks as rays of MuJoCo say; pictures that show it."""
     cube = {**ball((-0.7, 1.0), (1.8, 0, 0), "box_0", friction=0.3), "type": "box", "size": [0.17] * 3}
@@ -275,7 +272,7 @@ def test_blender_simulates_and_draws():
     bodies = scene.bodies()
     for body in bodies:
         body["linear_damping"] = body["angular_damping"] = 0.0
-    with Studio(BPY) as studio:
+    with Studio(os.environ["BPY_PYTHON"]) as studio:
         position, quaternion = studio.simulate(bodies, -9.81, 1.0)
         again, _ = studio.simulate(bodies, -9.81, 1.0)
         assert (position == again).all()

@@ -12,9 +12,10 @@ from pathlib import Path
 import pytest
 from many_clips import TINY, TINY_CALL, job_of, tiny_clip
 
+from mjx_refine.children import ONE_THREAD
 from mjx_refine.cli.main import run
 from mjx_refine.many import Job, ManyProgress, refine_many
-from mjx_refine.many.work import ONE_THREAD, work
+from mjx_refine.many.work import work
 
 FILES = ["checkpoint.npz", "history.csv", "overlay.gif", "refined.yaml", "report.html", "result.json"]
 

@@ -6,15 +6,16 @@ from pathlib import Path
 import pytest
 from many_clips import job_of, tiny_clip
 
+from mjx_refine.children import ONE_THREAD, inherited
 from mjx_refine.cli.main import run
 from mjx_refine.cli.many import told
 from mjx_refine.errors import InputError
 from mjx_refine.many import Job, jobs_of_pairs, load_jobs
 from mjx_refine.many.groups import Waiting, kind_of_job
 from mjx_refine.many.outcome import Outcome, result_of
-from mjx_refine.many.pool import _environment, default_workers
+from mjx_refine.many.pool import default_workers
 from mjx_refine.many.run import Many
-from mjx_refine.many.work import ONE_THREAD, cleared, work
+from mjx_refine.many.work import cleared, work
 from mjx_refine.scene import load_scenes
 from mjx_refine.search import Options
 
@@ -181,7 +182,7 @@ def test_the_exit_status_of_the_whole(statuses, status):
 def test_a_child_s_environment_is_ours_again_after(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("XLA_FLAGS", raising=False)
-    with _environment(ONE_THREAD):
+    with inherited(ONE_THREAD):
         assert os.environ["OMP_NUM_THREADS"] == "7"  # what the user has set stays
         assert "intra_op_parallelism_threads=1" in os.environ["XLA_FLAGS"]
     assert "XLA_FLAGS" not in os.environ

@@ -1,0 +1,39 @@
+"""Child processes that compute: what they inherit, and that they end with their parent."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Mapping
+
+ONE_THREAD = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+}
+"""Environment of a process that computes with one thread, read when numpy is imported and JAX begins: several processes
+whose linear algebra has a thread for every core wait for one another ten times as long as they compute."""
+
+
+@contextlib.contextmanager
+def inherited(values: Mapping[str, str]) -> Iterator[None]:
+    """This process's environment with ``values`` for a while, for a child to inherit; what the user has set stays."""
+    added = [name for name in values if name not in os.environ]
+    os.environ.update({name: values[name] for name in added})
+    try:
+        yield
+    finally:
+        for name in added:
+            os.environ.pop(name, None)
+
+
+def exit_with_parent(last: Callable[[], None] = lambda: None) -> None:
+    """Waits for the parent's end, does ``last`` and ends this process, which must not write on in a folder that a next call
+    may be working in; does nothing in a process without a parent."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        last()
+        os._exit(1)
