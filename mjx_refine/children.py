@@ -17,6 +17,11 @@ ONE_THREAD = {
 whose linear algebra has a thread for every core wait for one another ten times as long as they compute."""
 
 
+def cores() -> int:
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @contextlib.contextmanager
 def inherited(values: Mapping[str, str]) -> Iterator[None]:
     """This process's environment with ``values`` for a while, for a child to inherit; what the user has set stays."""

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mjx_refine import files
+from mjx_refine.children import cores
 from mjx_refine.errors import InputError
 from mjx_refine.generate.make import Tally
 from mjx_refine.generate.options import GenerateOptions
@@ -205,11 +206,6 @@ def _environment(options: GenerateOptions, processes: int, device: str) -> dict[
 
         check_renderer()
     return values
-
-
-def cores() -> int:
-    """Those that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _workers(workers: int | None, jobs: int) -> int:

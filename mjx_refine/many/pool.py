@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import importlib.util
 import multiprocessing
-import os
 import signal
 import threading
 from collections.abc import Generator
@@ -14,7 +13,7 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
-from mjx_refine.children import ONE_THREAD, exit_with_parent, inherited
+from mjx_refine.children import ONE_THREAD, cores, exit_with_parent, inherited
 from mjx_refine.errors import InputError
 from mjx_refine.many.groups import Kind, Waiting
 from mjx_refine.many.jobs import Job
@@ -26,11 +25,6 @@ from mjx_refine.sim.backends import resolve_backend
 
 MOST_FALSE_STARTS = 3
 """Workers that may end before they are ready, since the last that was."""
-
-
-def cores() -> int:
-    """Those that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def default_workers(options: Options) -> int | None:
