@@ -2,6 +2,7 @@
 
     python -m benchmarks.real_poses tosses FOLDER [--count 10] [--out runs/tosses]
     python -m benchmarks.real_poses drops FOLDER [--count 11] [--out runs/drops]
+    python -m benchmarks.real_poses tosses|drops FOLDER --together     # of one set-up: half are fitted, half judged
 
 FOLDER holds ``toss_NNN.npz`` (Pfrommer, Halm, Posa, CoRL 2020, arXiv:2009.11193; BSD-3-Clause) or ``ball_drops.csv`` and
 ``balls.txt`` (de Silva et al., Front. Artif. Intell. 3:25, 2020; MIT). Nothing of them is kept here.
@@ -12,6 +13,8 @@ from __future__ import annotations
 import argparse
 import csv
 import math
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +111,48 @@ def _common(told: Diagnosis) -> str:
     )
 
 
+def tosses_together(folder: Path, count: int | None, out: Path, seed: int) -> None:
+    """Prints candidates and a row a toss of one diagnosis of all."""
+    recordings = [toss(path) for path in sorted(folder.glob("toss_*.npz"))[:count]]
+    told = diagnose_poses(cube(), recordings, seed=seed, told=shown)
+    write_diagnosis(out / "tosses", told, None, {"poses": [one.source for one in recordings], "seed": seed})
+    summary(told)
+    scene = told.base.objects[0]
+    print(f"\nbase model: half edges {scene.size} m, friction {scene.friction}, damping {scene.damping} 1/s\n")
+    print("| toss | role | error before | after | floor | gain | mm before | after | ° before | after |")
+    print("| --- " * 10 + "|")
+    for one in told.clips:
+        print(
+            f"| {one.source[5:8]} | {'fitted' if one.fitted else 'judged'} | {one.before:.2f} | {one.after:.2f} | "
+            f"{one.noise_floor:.2f} | {one.gain:.1f} | {1e3 * one.position_before:.1f} | {1e3 * one.position_after:.1f} | "
+            f"{math.degrees(one.rotation_before):.2f} | {math.degrees(one.rotation_after):.2f} |"
+        )
+
+
+def shown(line: str) -> None:
+    """A step and the time at which it began."""
+    print(f"{time.strftime('%H:%M:%S')} {line}", file=sys.stderr, flush=True)
+
+
+def summary(told: Diagnosis) -> None:
+    """The verdict, the gap and the candidates."""
+    gap = told.gap
+    print(f"verdict {' + '.join(told.verdict.effects) or 'none'} {told.verdict.probability:.2f}; {told.seconds:.0f} s, "
+          f"{told.rollouts} rollouts\n"
+          f"held out: {gap.before:.2f} -> {gap.after:.2f} noise widths (floor {gap.noise_floor:.2f}), closed {gap.closed:.2f} "
+          f"({gap.closed_low:.2f} to {gap.closed_high:.2f}); {1e3 * gap.position_before:.1f} -> "
+          f"{1e3 * gap.position_after:.1f} mm, {math.degrees(gap.rotation_before):.2f} -> "
+          f"{math.degrees(gap.rotation_after):.2f} degrees\n")  # fmt: skip
+    print("\n".join(f"- {note}" for note in (*told.notes, told.residual)))
+    print("\n| candidate | evidence on the fitted | held-out error after | closed | parameters |")
+    print("| --- " * 5 + "|")
+    for one in told.candidates:
+        values = ", ".join(
+            f"{k} {v.value:.3g} ({v.low:.3g} to {v.high:.3g}) {v.unit}" for k, v in one.parameters.items()
+        )
+        print(f"| {one.effect} | {one.evidence:.0f} | {one.gap_after:.2f} | {one.closed:.2f} | {values} |")
+
+
 # --- ball drops -------------------------------------------------------------------------------------------------------
 
 
@@ -168,6 +213,30 @@ def drops(folder: Path, count: int | None, out: Path, seed: int) -> None:
     )
 
 
+def drops_together(folder: Path, count: int | None, out: Path, seed: int) -> None:
+    """Prints a row a ball: one drop is fitted, the other foretold from its first part on."""
+    sizes = balls(folder)
+    print(
+        "| ball | verdict | drag's lead | best other | its lead | error foretold of the other drop | with drag | closed by it | "
+        "deceleration at 20 m/s, m/s² | reference | m before | after | s |"
+    )
+    print("| --- " * 13 + "|", flush=True)
+    tracks = heights(folder)
+    for ball in sorted({ball for ball, _ in tracks})[:count]:
+        mass, radius = sizes[KEYS[ball]]
+        body = Body("sphere", "ball", (radius,), (0.0, 0.0, 40.0), mass=mass)
+        several = [falling(track, f"{ball} {drop}") for (name, drop), track in sorted(tracks.items()) if name == ball]
+        told = diagnose_poses(Scene((body,), CAMERA, (0.0, 0.0, -9.81)), several, seed=seed)
+        write_diagnosis(out / KEYS[ball], told, None, {"poses": [one.source for one in several], "seed": seed})
+        reference = 0.5 * RHO * DRAG_COEFFICIENT * math.pi * radius**2 * 400 / mass
+        print(
+            f"| {ball} | {' + '.join(told.verdict.effects) or 'none'} {told.verdict.probability:.2f} | "
+            f"{_of_drag(told, mass)[1]} | {reference:.2f} | {told.gap.position_before:.2f} | {told.gap.position_after:.2f} | "
+            f"{told.seconds:.0f} |",
+            flush=True,
+        )
+
+
 def _of_drag(told: Diagnosis, mass: float, speed: float = 20.0) -> tuple[float, str]:
     """What drag, if it was fitted at all, does at ``speed`` [m/s^2], and cells of the table."""
     drag = next((c for c in told.candidates if c.effect == "drag"), None)
@@ -190,12 +259,17 @@ def main() -> None:
     parser.add_argument("--count", type=int, help="so many recordings; all by default")
     parser.add_argument("--out", type=Path, default=Path("runs/real_poses"))
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--together", action="store_true", help="all tosses, or all drops of a ball, in one diagnosis")
     arguments = parser.parse_args()
     print(f"{machine()}\n")
-    if arguments.what == "tosses":
-        tosses(arguments.folder, arguments.count, arguments.out, arguments.seed)
-    else:
-        drops(arguments.folder, arguments.count, arguments.out, arguments.seed)
+    runs = {
+        ("tosses", False): tosses,
+        ("drops", False): drops,
+        ("tosses", True): tosses_together,
+        ("drops", True): drops_together,
+    }
+    run = runs[arguments.what, arguments.together]
+    run(arguments.folder, arguments.count, arguments.out, arguments.seed)
 
 
 if __name__ == "__main__":

@@ -98,7 +98,9 @@ class ClipFit:
         self.predictor = Predictor(simulator.shapes, measured.pixels, measured.places, image, simulator.fps)
         self.rollouts = 0.0
         self.counts = Counts()
+        self.slackness = 1.0
         self._columns: np.ndarray | None = None
+        self._kicks = 0
         self._slacks: dict[bytes | None, Slack] = {}
 
     def allow_slack(self, fit: Fit) -> int:
@@ -120,8 +122,13 @@ class ClipFit:
             many = batch.map(lambda a: np.repeat(a[:1], len(rows), 0))
             moved = self.predictor(rows, many)
             columns.append(self.whitened(self._change(moved, still), None, 1e9)[~moved.bad])
-        self._columns = np.concatenate(columns).T
+        self._set_columns(columns)
         return len(found)
+
+    def _set_columns(self, columns: list[np.ndarray]) -> None:
+        """What may err by one standard deviation: rows that always may, then those of contacts."""
+        self._columns, self._slacks = np.concatenate(columns).T, {}
+        self._kicks = len(columns[0])
 
     def _change(self, moved: Prediction, still: Prediction) -> Parts:
         """From one prediction to others [px], zero where nothing was measured."""
@@ -177,11 +184,22 @@ class ClipFit:
             return None
         key = None if keep is None else keep.tobytes()
         if key not in self._slacks:
-            columns = self._columns if keep is None else self._columns * self._kept(keep)[:, None]
-            self._slacks[key] = slack_of(columns)
+            columns = self.slack_columns(self.slackness)
+            self._slacks[key] = slack_of(columns if keep is None else columns * self.kept(keep)[:, None])
         return self._slacks[key]
 
-    def _kept(self, keep: np.ndarray) -> np.ndarray:
+    def slack_columns(self, slackness: float) -> Float[np.ndarray, "residuals columns"]:
+        """What the residuals may err by, one standard deviation a column, with contacts that err so many times as much."""
+        if self._columns is None:
+            return np.zeros((sum(part.size for part in self.measured.parts), 0))
+        scale = np.where(np.arange(self._columns.shape[1]) < self._kicks, 1.0, slackness)
+        return self._columns if slackness == 1.0 else self._columns * scale
+
+    def set_slackness(self, slackness: float) -> None:
+        """How much contacts may err, as a multiple of what they may in one clip alone."""
+        self.slackness, self._slacks = slackness, {}
+
+    def kept(self, keep: np.ndarray) -> np.ndarray:
         """Which residuals belong to kept frames."""
         m = self.measured
         both = keep[:-1] & keep[1:]
@@ -207,6 +225,13 @@ class ClipFit:
         scale: float,
     ) -> Float[np.ndarray, "batch residuals"]:
         """Robust residuals in noise widths; zero where nothing was measured, and in frames that are not kept."""
+        white, slack = self.rigid(distances, keep, scale), self._slack(keep)
+        return white if slack is None else slack(white)
+
+    def rigid(
+        self, distances: Parts, keep: Bool[np.ndarray, "frames"] | None, scale: float
+    ) -> Float[np.ndarray, "batch residuals"]:
+        """As ``whitened``, but nothing excuses what contacts err by."""
         noise, counts = self.noise, self.counts.of(distances)
         slow = self.measured.freshness[:, :, None] ** -0.5
         widths = (noise.edge[:, :, None] * slow, noise.flow[:, :, None, None], noise.moments * slow, noise.background)
@@ -215,10 +240,7 @@ class ClipFit:
             for raw, sigma, count, patience in zip(distances, widths, counts, PATIENCE, strict=True)
         ]
         white = Parts(*parts).flat()
-        if keep is not None:
-            white = white * self._kept(keep)
-        slack = self._slack(keep)
-        return white if slack is None else slack(white)
+        return white if keep is None else white * self.kept(keep)
 
     def expected(self, beside: bool = True) -> float:
         """Sum of squares that noise alone would give, with the background's or without."""

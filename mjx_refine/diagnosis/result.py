@@ -34,6 +34,7 @@ class Place:
       phase: ``flight, impact, sliding, rolling, rest, whole``.
       channel: ``motion, rotation, shape, camera, timing, perception``.
       share: of the misfit above the noise.
+      clip: of several clips, which one (its number); otherwise None.
     """
 
     object: str | None
@@ -41,6 +42,7 @@ class Place:
     phase: str
     channel: str
     share: float
+    clip: int | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,6 +147,34 @@ class PoseErrors:
 
 
 @dataclasses.dataclass(frozen=True)
+class ClipGap:
+    """One of several clips of a set-up.
+
+    Attributes:
+      source: where it came from.
+      fitted: whether it was fitted; otherwise it was held out and judged, from a part of its time on.
+      before: root mean square error of the base model [noise widths]; of a fitted clip over all that was fitted.
+      after: ditto with the verdict's effects.
+      noise_floor: as ``Gap.noise_floor``; NaN for a fitted clip.
+      gain: of a held-out clip's likelihood by the verdict's effects, or else by the best candidate's [natural logarithms];
+        NaN for a fitted clip.
+      position_before, position_after: where poses were measured, root mean square errors of positions [m]; otherwise NaN.
+      rotation_before, rotation_after: ditto of rotations [rad].
+    """
+
+    source: str
+    fitted: bool
+    before: float
+    after: float
+    noise_floor: float = math.nan
+    gain: float = math.nan
+    position_before: float = math.nan
+    position_after: float = math.nan
+    rotation_before: float = math.nan
+    rotation_after: float = math.nan
+
+
+@dataclasses.dataclass(frozen=True)
 class Diagnosis:
     """All that a diagnosis found.
 
@@ -166,6 +196,7 @@ class Diagnosis:
       seconds: how long it took.
       rollouts: how many were simulated.
       pose_errors: where poses were measured, not pictures.
+      clips: of several clips, each; scenes, maps and pose errors are then those of the first.
     """
 
     verdict: Verdict
@@ -185,6 +216,7 @@ class Diagnosis:
     seconds: float
     rollouts: int
     pose_errors: PoseErrors | None = None
+    clips: tuple[ClipGap, ...] = ()
 
 
 CHANNELS = ("motion", "rotation", "shape", "camera", "timing", "perception")

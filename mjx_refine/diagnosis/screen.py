@@ -82,18 +82,20 @@ class Screen:
 
     def _family(self, kind: EffectKind, target: int) -> list[Lead]:
         starts = kind.starts(self.view, target)
-        if not starts:
-            return []
-        white = self._predicted(kind, target, starts)
+        return self.looked(kind, target, starts) if starts else []
+
+    def looked(self, kind: EffectKind, target: int, starts: list[Start]) -> list[Lead]:
+        """The best few of some starts of one effect and target."""
+        white = self.predicted(kind, target, starts)
         result, row = [], 0
         for start in starts:
             count = max(len(start.columns), 1)
             part = white[row : row + count]
             row += count
             result.append(self._lead(kind, target, start, part))
-        return _distinct(sorted(result, key=lambda lead: -lead.gain))
+        return distinct(sorted(result, key=lambda lead: -lead.gain))
 
-    def _predicted(self, kind: EffectKind, target: int, starts: list[Start]) -> np.ndarray:
+    def predicted(self, kind: EffectKind, target: int, starts: list[Start]) -> np.ndarray:
         """Residuals at every start's steps, (rows, R)."""
         frames = self.clip.frames
         rows: list[np.ndarray] = []
@@ -154,7 +156,7 @@ class Screen:
         return fit.cost - 0.5 * float(before @ self.inverse @ before) - now, -self.inverse @ gradient
 
 
-def _distinct(leads: list[Lead], most: int = 3) -> list[Lead]:
+def distinct(leads: list[Lead], most: int = 3) -> list[Lead]:
     """The best few that do not begin at nearly the same place."""
     result: list[Lead] = []
     for lead in leads:

@@ -140,15 +140,15 @@ def _singles(
     for again in range(2):
         told("looking ahead")
         view = view_of(clip, base, observation, masks_of)
-        chosen = _chosen(Screen(clip, base, view).leads(names), FAMILIES if again == 0 else 3)
+        chosen = chosen_of(Screen(clip, base, view).leads(names), FAMILIES if again == 0 else 3)
         for lead in chosen:
-            told(f"{lead.name} {_target_name(scene, lead.target)}".strip())
+            told(f"{lead.name} {target_name(scene.names, lead.target)}".strip())
             _fit_lead(clip, base, lead, fitted)
         if again == 0:
             # The base model's fit has bent its parameters towards the effect; from the given scene the way is straight.
             given = Screen(clip, zero, view_of(clip, zero, observation, masks_of), FORGIVING).leads(names)
-            for lead in _chosen(given, FRESH, 1):
-                told(f"{lead.name} {_target_name(scene, lead.target)}".strip())
+            for lead in chosen_of(given, FRESH, 1):
+                told(f"{lead.name} {target_name(scene.names, lead.target)}".strip())
                 _fit_lead(clip, zero, lead, fitted)
         _walls_from_pushes(clip, base, fitted, names, view, told)
         best = max((fit for fit, _ in fitted.values()), key=lambda fit: fit.evidence, default=base)
@@ -191,7 +191,7 @@ def _polished(clip: ClipFit, candidate: Candidate, base: Fit) -> Candidate:
     return dataclasses.replace(candidate, fit=fit, lead=_lead(fit, base))
 
 
-def _chosen(leads: list[Lead], families: int, starts: int = 2) -> list[Lead]:
+def chosen_of(leads: list[Lead], families: int, starts: int = 2) -> list[Lead]:
     """The best starts of the best families: several where place or moment matter, else one."""
     kept: dict[tuple[str, int], list[Lead]] = {}
     for lead in leads:
@@ -262,7 +262,7 @@ def _pairs(clip: ClipFit, base: Fit, singles, names, observation, masks_of, told
             [n for n in names if n not in first.names or catalogue()[n].targeted]
         )
         leads = [x for x in leads if (x.name, x.target) not in set(zip(first.names, first.targets, strict=True))]
-        chosen = [x for x in _chosen(leads, 3) if x.gain > SECOND_PROMISE][:3]
+        chosen = [x for x in chosen_of(leads, 3) if x.gain > SECOND_PROMISE][:3]
         for lead in chosen:
             told(f"{first.names[0]} and {lead.name}")
             one = lead.term(clip.frames)
@@ -287,8 +287,9 @@ def _again(
     return base, tuple(sorted(found, key=lambda c: -c.lead)), impacts
 
 
-def _target_name(scene: Scene, target: int) -> str:
-    return scene.names[target] if target >= 0 else ""
+def target_name(names: tuple[str, ...], target: int) -> str:
+    """The object's name, or nothing where an effect has no single object."""
+    return names[target] if target >= 0 else ""
 
 
 # --- what kinds see ---------------------------------------------------------------------------------------------------

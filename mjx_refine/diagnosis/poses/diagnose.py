@@ -41,7 +41,7 @@ UNCALIBRATED = (
 )
 
 
-def diagnose_poses(
+def diagnose_recording(
     scene: Scene,
     poses: Poses,
     *,
@@ -64,12 +64,12 @@ def diagnose_poses(
       InputError: the scene has effects, the names do not match, nothing moves, or there are too few samples.
     """
     began = time.monotonic()
-    columns = _columns(scene, poses)
-    _check(scene, poses)
+    columns = columns_of(scene, poses)
+    check_poses(scene, poses)
     told = told or (lambda line: None)
     scene = started(scene, poses, columns)
     clip = PosesFit(MujocoSimulator(scene.shapes, rate_of(poses.time), threads), poses, columns)
-    _check_motion(clip, poses)
+    check_motion(clip, poses)
     left_out = (*without, *(name for name, kind in catalogue().items() if not kind.physical))
     blank = Observation(np.zeros((clip.frames - 1, 8, 8, 2), np.float32), None, clip.simulator.fps)
     space = poses_space(scene)
@@ -96,12 +96,12 @@ def _with_plain(diagnosis: Diagnosis, plain: Errors, impacts: int) -> Diagnosis:
     told = diagnosis.pose_errors
     if told is None or not impacts:
         return diagnosis
-    note = f"The base model's fit in which they may not err is off by {_words(plain)} over all samples."
+    note = f"The base model's fit in which they may not err is off by {words(plain)} over all samples."
     errors = dataclasses.replace(told, plain=(plain.position, plain.rotation))
     return dataclasses.replace(diagnosis, notes=(*diagnosis.notes, note), pose_errors=errors)
 
 
-def _columns(scene: Scene, poses: Poses) -> tuple[int, ...]:
+def columns_of(scene: Scene, poses: Poses) -> tuple[int, ...]:
     """For each object its index among the poses, or -1."""
     if not poses.names:
         if len(scene.objects) != 1:
@@ -118,7 +118,7 @@ def _columns(scene: Scene, poses: Poses) -> tuple[int, ...]:
     return tuple(poses.names.index(name) if name in poses.names else -1 for name in scene.names)
 
 
-def _check(scene: Scene, poses: Poses) -> None:
+def check_poses(scene: Scene, poses: Poses) -> None:
     if scene.effects:
         raise InputError(
             f"scene: it has an effect already ({scene.effects[0].effect}); a diagnosis starts from the base model; remove "
@@ -137,7 +137,7 @@ def _check(scene: Scene, poses: Poses) -> None:
         )
 
 
-def _check_motion(clip: PosesFit, poses: Poses) -> None:
+def check_motion(clip: PosesFit, poses: Poses) -> None:
     m = clip.measured
     place = (np.nanmax(_known(m.moments), 0) - np.nanmin(_known(m.moments), 0)) / m.moment_noise
     turn = np.arccos(np.clip(np.abs(np.nanmin(_known(_turned(clip)), 0)), 0.0, 1.0)) * 2 / m.edge_noise
@@ -264,11 +264,11 @@ def _notes(
     names: tuple[str, ...],
     columns: tuple[int, ...],
 ) -> tuple[str, ...]:
-    notes = [UNCALIBRATED, _noise_words(clip)]
+    notes = [UNCALIBRATED, noise_words(clip)]
     if best is not None:
-        notes.append(f"On held-out samples the error goes from {_words(outside[1])} to {_words(outside[2])}.")
+        notes.append(f"On held-out samples the error goes from {words(outside[1])} to {words(outside[2])}.")
     else:
-        notes.append(f"On held-out samples the base model errs by {_words(outside[1])}.")
+        notes.append(f"On held-out samples the base model errs by {words(outside[1])}.")
     lost = [n for n, j in zip(names, columns, strict=True) if j < 0]
     if lost:
         notes.append(f"No poses of {', '.join(lost)}: nothing is known of it.")
@@ -279,7 +279,7 @@ def _notes(
     return tuple(notes)
 
 
-def _noise_words(clip: PosesFit) -> str:
+def noise_words(clip: PosesFit) -> str:
     m = clip.measured
     source = "as stated" if m.stated else "from third differences in time; of smoothed poses that is too little"
     moved = m.moment_noise[np.isfinite(m.moments).any(0)]
@@ -289,7 +289,7 @@ def _noise_words(clip: PosesFit) -> str:
     return f"A frame is {1e3 / clip.simulator.fps:.4g} ms of simulation. Noise of {', of '.join(parts)}."
 
 
-def _words(errors: Errors) -> str:
+def words(errors: Errors) -> str:
     parts = []
     if math.isfinite(errors.position):
         parts.append(f"{errors.position:.2g} m")

@@ -134,9 +134,11 @@ class PosesFit(ClipFit):
       simulator: of the scene kind, at ``rate_of`` the times.
       poses: what was measured.
       columns: for each object its index among the poses, or -1.
+      weight: as how many independent samples each counts.
     """
 
-    def __init__(self, simulator: Simulator, poses: Poses, columns: tuple[int, ...]):
+    def __init__(self, simulator: Simulator, poses: Poses, columns: tuple[int, ...], weight: float = 1.0):
+        self.weight = weight
         measured = measured_poses(poses, columns)
         self.time = poses.time - poses.time[0]
         place = self.time * simulator.fps
@@ -174,7 +176,7 @@ class PosesFit(ClipFit):
             self.rollouts += len(rows)
             moved = self.predictor(rows, batch)
             columns.append(self.whitened(self._change(moved, still), None, 1e9)[~moved.bad])
-        self._columns = np.concatenate(columns).T
+        self._set_columns(columns)
         return len(found)
 
     def _contacts(self, batch: SceneBatch, poses: np.ndarray) -> tuple[list[Impact], list[Impact]]:
@@ -212,6 +214,10 @@ class PosesFit(ClipFit):
         reach = np.array(rows) if rows else none
         return Parts(reach, *(np.zeros((len(reach), *part.shape)) for part in self.measured.parts[1:]))
 
+    def expected(self, beside: bool = True) -> float:
+        """As ``ClipFit.expected``, with the samples' weight."""
+        return max(self.weight * super().expected(beside), 1e-9)
+
     def jacobian(self, hypothesis, z, base, keep=None, scale=SCALE, size=STEPS[0]):
         """As ``ClipFit.jacobian``, in one rollout, since every parameter moves something."""
         low, high = hypothesis.bounds
@@ -226,14 +232,11 @@ class PosesFit(ClipFit):
         told = zip(prediction.parts, self.measured.parts, strict=True)
         return Parts(*(np.where(np.isfinite(seen), a - np.nan_to_num(seen), np.nan) for a, seen in told))
 
-    def whitened(
+    def rigid(
         self, distances: Parts, keep: Bool[np.ndarray, "times"] | None, scale: float = SCALE
     ) -> Float[np.ndarray, "batch residuals"]:
         """Robust residuals in noise widths; zero where nothing was measured, and in samples that are not kept."""
         widths = (self.noise.edge[:, :, None], 1.0, self.noise.moments, 1.0)
         raw = [np.nan_to_num(part) / width for part, width in zip(distances, widths, strict=True)]
-        white = Parts(*(slowed(part, scale * PATIENCE) for part in raw)).flat()
-        if keep is not None:
-            white = white * self._kept(keep)
-        slack = self._slack(keep)
-        return white if slack is None else slack(white)
+        white = Parts(*(slowed(part, scale * PATIENCE) for part in raw)).flat() * np.sqrt(self.weight)
+        return white if keep is None else white * self.kept(keep)

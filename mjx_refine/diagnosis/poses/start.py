@@ -112,7 +112,11 @@ def fit_base(clip: PosesFit, space: Space, seed: int) -> Fit:
         if keep.sum() < FEWEST:
             continue
         grown = clip.fit(hypothesis, z, 4, keep, FORGIVING)
-        z = clip.hop(grown, seed, 1, 48, keep, FORGIVING).z if 2 * grown.data > GOOD * 6 * keep.sum() else grown.z
+        z = (
+            clip.hop(grown, seed, 1, 48, keep, FORGIVING).z
+            if 2 * grown.data > GOOD * 6 * clip.weight * keep.sum()
+            else grown.z
+        )
     fits.append(clip.fit(hypothesis, z, 12))
     best = min(fits, key=lambda fit: fit.cost)
     return best if clip.misfit(best) < GOOD else clip.hop(best, seed, 2)

@@ -1,0 +1,236 @@
+"""Least squares of one set-up on several clips: robust, with a standard normal prior, and its evidence."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mjx_refine.batch import concatenate
+from mjx_refine.diagnosis.fit import DAMPINGS, SCALE, STEPS, ClipFit, Fit, prior
+from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.joint.arrow import Arrow
+from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis, with_frozen_setup
+from mjx_refine.effects import acting
+
+Keeps = Sequence[Bool[np.ndarray, "frames"]] | None
+
+TOGETHER = 512
+"""Candidates of several clips that are simulated in one batch: effects that need a look at every step share its overhead."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JointFit:
+    """Where least squares ended.
+
+    Attributes:
+      hypothesis: what was fitted.
+      z: the point.
+      cost: half the sum of squares, with the prior.
+      data: ditto without the prior.
+      parts: each clip's side of it; their ``cost`` is their ``data``, and their ``evidence`` says nothing.
+      evidence: logarithm of the hypothesis' probability, up to a constant of the clips.
+    """
+
+    hypothesis: JointHypothesis
+    z: Float[np.ndarray, "dimension"]
+    cost: float
+    data: float
+    parts: tuple[Fit, ...]
+    evidence: float
+
+    @property
+    def gradient(self) -> Float[np.ndarray, "dimension"]:
+        """Of the cost."""
+        price, slope = prior(self.hypothesis, self.z)  # type: ignore[arg-type]
+        return _gathered(self.hypothesis, [p.jacobian.T @ p.residual for p in self.parts]) + slope * price
+
+    @property
+    def curvature(self) -> Arrow:
+        """Of the cost, by Gauss and Newton."""
+        slope = prior(self.hypothesis, self.z)[1]  # type: ignore[arg-type]
+        return Arrow.of([p.jacobian.T @ p.jacobian for p in self.parts], self.hypothesis.masks, slope**2)
+
+
+def _gathered(hypothesis: JointHypothesis, parts: list[np.ndarray]) -> np.ndarray:
+    """The sum of parts' vectors (or columns of them) in joint coordinates."""
+    result = np.zeros((hypothesis.dimension, *parts[0].shape[1:]))
+    for part, index in zip(parts, hypothesis.index, strict=True):
+        result[index] += part
+    return result
+
+
+class Clips:
+    """Residuals and least squares of several clips.
+
+    Args:
+      clips: each with its measurements; those of one scene kind and rate should have one simulator.
+    """
+
+    def __init__(self, clips: Sequence[ClipFit]):
+        self.clips = tuple(clips)
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    @property
+    def rollouts(self) -> float:
+        return sum(clip.rollouts for clip in self.clips)
+
+    @property
+    def frames(self) -> int:
+        """Of the longest clip."""
+        return max(clip.frames for clip in self.clips)
+
+    def expected(self) -> float:
+        """Sum of squares that noise alone would give."""
+        return sum(clip.expected() for clip in self.clips)
+
+    def misfit(self, fit: JointFit) -> float:
+        """Mean square residual of the objects in noise widths."""
+        weights = np.array([clip.expected(beside=False) for clip in self.clips])
+        each = np.array([clip.misfit(part) for clip, part in zip(self.clips, fit.parts, strict=True)])
+        return float((weights * each).sum() / weights.sum())
+
+    # --- rollouts -------------------------------------------------------------------------------------------------
+    def poses(self, hypothesis: JointHypothesis, points: list[np.ndarray]) -> list[np.ndarray]:
+        """Rollouts at each part's points, (batch, frames, objects, 7) a clip."""
+        batches = [part.batch(z) for part, z in zip(hypothesis.parts, points, strict=True)]
+        lengths = {tuple(e.values.shape[1] for e in batch.effects) for batch in batches}
+        simulators = {id(clip.simulator) for clip in self.clips}
+        if not (acting.has_loads(batches[0]) and len(lengths) == 1 and len(simulators) == 1):
+            return [clip.simulator.rollout(b, clip.frames) for clip, b in self._counted(batches)]
+        whole = concatenate([batch for _, batch in self._counted(batches)])
+        rows = [
+            self.clips[0].simulator.rollout(whole[slice(k, k + TOGETHER)], self.frames)
+            for k in range(0, len(whole), TOGETHER)
+        ]
+        parts = np.split(np.concatenate(rows), np.cumsum([len(b) for b in batches])[:-1])
+        return [part[:, : clip.frames] for clip, part in zip(self.clips, parts, strict=True)]
+
+    def _counted(self, batches):
+        for clip, batch in zip(self.clips, batches, strict=True):
+            clip.rollouts += len(batch)
+            yield clip, batch
+
+    # --- residuals ------------------------------------------------------------------------------------------------
+    def residuals(self, hypothesis: JointHypothesis, z: np.ndarray, keeps: Keeps = None, scale: float = SCALE):
+        """(residuals (B, R) a clip, half their sum of squares with the prior (B,))."""
+        points = hypothesis.split(z)
+        cost = 0.5 * (prior(hypothesis, z)[0] ** 2).sum(1)  # type: ignore[arg-type]
+        rows = []
+        for c, poses in enumerate(self.poses(hypothesis, points)):
+            white, bad = self._white(c, hypothesis.parts[c], points[c], poses, keeps, scale)
+            cost = np.where(bad, np.inf, cost + 0.5 * (white**2).sum(1))
+            rows.append(white)
+        return rows, cost
+
+    def _white(self, c: int, part: Hypothesis, z: np.ndarray, poses: np.ndarray, keeps: Keeps, scale: float):
+        clip = self.clips[c]
+        prediction = clip.predictor(poses, part.batch(z))
+        white = clip.whitened(clip.distances(prediction), None if keeps is None else keeps[c], scale)
+        return white, prediction.bad
+
+    def jacobians(self, hypothesis: JointHypothesis, z, base, keeps: Keeps = None, scale=SCALE, size=STEPS[0]):
+        """d residuals / d z of each clip in its own coordinates, (R, part)."""
+        points, steps, moved = [], [], []
+        for part, at in zip(hypothesis.parts, hypothesis.split(z), strict=True):
+            step = np.where(at + size > part.bounds[1], -size, size)
+            points.append(np.clip(at + np.diag(step), *part.bounds))
+            steps.append(step)
+            moved.append(np.concatenate([at[None], points[-1][part.moves]]))
+        result = []
+        for c, poses in enumerate(self.poses(hypothesis, moved)):
+            whole = np.repeat(poses[:1], len(points[c]), 0)
+            whole[hypothesis.parts[c].moves] = poses[1:]
+            white, bad = self._white(c, hypothesis.parts[c], points[c], whole, keeps, scale)
+            result.append((np.where(bad[:, None], 0.0, white - base[c]) / steps[c][:, None]).T)
+        return result
+
+    # --- least squares --------------------------------------------------------------------------------------------
+    def fit(
+        self, hypothesis: JointHypothesis, z: np.ndarray, iterations: int = 12, keeps: Keeps = None, scale=SCALE
+    ) -> JointFit:
+        """Levenberg-Marquardt from ``z``, as ``ClipFit.fit``."""
+        low, high = hypothesis.bounds
+        z = np.clip(z, low, high)
+        rows, costs = self.residuals(hypothesis, z[None], keeps, scale)
+        base, cost = [row[0] for row in rows], float(costs[0])
+        size, failed, damping = STEPS[0], 0, 1.0
+        fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale))
+        for _ in range(iterations):
+            gradient, curvature = fit.gradient, fit.curvature
+            trials = np.array([_step(z, gradient, curvature, f, low, high) for f in DAMPINGS * damping])
+            rows, costs = self.residuals(hypothesis, trials, keeps, scale)
+            best = int(np.argmin(costs))
+            gain = cost - float(costs[best])
+            if gain > 0:
+                z, base, cost = trials[best], [row[best] for row in rows], float(costs[best])
+                damping = float(np.clip(damping * DAMPINGS[best], 1e-3, 1e3))
+            if gain < 0.05 + 1e-4 * cost:
+                failed += 1
+                if failed > len(STEPS):
+                    break
+                shorter = failed == 1 and gain <= 0
+                damping = min(300.0 * damping, 1e3) if shorter else 1.0
+                size = size if shorter else STEPS[(STEPS.index(size) + 1) % len(STEPS)]
+            else:
+                failed = 0
+            fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale, size))
+        if size != STEPS[0] or fit.z is not z:
+            fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale))
+        return fit
+
+    def at(self, hypothesis: JointHypothesis, z: np.ndarray, keeps: Keeps = None, scale: float = SCALE) -> JointFit:
+        """No step, just what holds at ``z``."""
+        base = [row[0] for row in self.residuals(hypothesis, z[None], keeps, scale)[0]]
+        return self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale))
+
+    def best_of(self, hypothesis: JointHypothesis, points: np.ndarray) -> np.ndarray:
+        """The point with the least cost."""
+        points = np.clip(points, *hypothesis.bounds)
+        return points[int(np.argmin(self.residuals(hypothesis, points)[1]))]
+
+    def _finished(self, hypothesis: JointHypothesis, z, base, jacobians) -> JointFit:
+        halves = [0.5 * float(row @ row) for row in base]
+        price, _ = prior(hypothesis, z)  # type: ignore[arg-type]
+        cost = sum(halves) + 0.5 * float(price @ price)
+        told = zip(hypothesis.parts, hypothesis.split(z), halves, jacobians, base, strict=True)
+        parts = tuple(Fit(part, at, half, half, jacobian, row, -half) for part, at, half, jacobian, row in told)
+        fit = JointFit(hypothesis, z, cost, sum(halves), parts, 0.0)
+        places = sum(np.log(t.places) for t in hypothesis.terms)
+        return dataclasses.replace(fit, evidence=-cost - 0.5 * fit.curvature.logdet - float(places))
+
+    # --- one clip at a time -----------------------------------------------------------------------------------------
+    def own(self, fit: JointFit, c: int, z: np.ndarray | None = None) -> tuple[Hypothesis, np.ndarray]:
+        """The hypothesis of clip ``c`` in which only its start is free, and where that stands."""
+        part, at = fit.hypothesis.parts[c], fit.hypothesis.split(fit.z if z is None else z)[c]
+        return with_frozen_setup(part, at), at[~fit.hypothesis.masks[c]]
+
+    def restarted(self, fit: JointFit, seed: int, good: float) -> JointFit:
+        """Clips that a fit leaves far off search for another start by themselves; then all are fitted again."""
+        z = fit.z.copy()
+        changed = False
+        for c, clip in enumerate(self.clips):
+            if clip.misfit(fit.parts[c]) < good:
+                continue
+            hypothesis, at = self.own(fit, c)
+            here = clip.fit(hypothesis, at, 6)
+            here = clip.hop(here, seed + c, 2)
+            if here.data < fit.parts[c].data - 1.0:
+                z[fit.hypothesis.index[c][~fit.hypothesis.masks[c]]] = here.z
+                changed = True
+        if not changed:
+            return fit
+        again = self.fit(fit.hypothesis, z, 8)
+        return again if again.cost < fit.cost else fit
+
+
+def _step(z, gradient, curvature: Arrow, factor: float, low, high) -> np.ndarray:
+    free = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
+    matrix = curvature.plus(factor * np.maximum(0.01 * curvature.diagonal, 1.0)).only(free)
+    step = np.where(free, -matrix.solve(np.where(free, gradient, 0.0)), 0.0)
+    step *= min(1.0, 12.0 / max(np.abs(step).max(initial=0.0), 1e-12))
+    return np.clip(z + step, low, high)

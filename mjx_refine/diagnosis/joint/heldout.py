@@ -1,0 +1,212 @@
+"""The gap on clips that no fit has seen.
+
+Of a held-out clip the set-up and its effects stay as the fitted clips have them; only where and how fast its objects start
+is fitted, on its first ``EARLY`` part, and the rest of it is foretold. No frame that is judged was seen by any fit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.heldout import BLOCK
+from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.joint.hypothesis import with_frozen_setup
+from mjx_refine.diagnosis.measure import Parts
+
+EARLY = 0.4
+"""Part of a held-out clip on which its start is fitted."""
+
+FORGIVING = 40.0
+"""Scale of the robust loss while the start is far off [noise widths]."""
+
+WIDE = 20.0
+"""Ditto of the errors that are judged."""
+
+DRAWS = 12
+"""Of the start's posterior, which say how well it foretells the rest."""
+
+GOOD = 2.5
+"""Mean square residual of the first part above which another start is looked for."""
+
+FEW = 3
+"""Clips below which an interval is taken over blocks of frames, since so few say nothing of others."""
+
+BOOTSTRAP = 1000
+
+
+def split(count: int, seed: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Which clips are fitted and which are judged: half and half, at random, the first always fitted since it is shown."""
+    others = 1 + np.random.default_rng((seed, count)).permutation(count - 1)
+    judged = sorted(int(k) for k in others[: count // 2])
+    return tuple(k for k in range(count) if k not in judged), tuple(judged)
+
+
+def early_part(time: Float[np.ndarray, "frames"]) -> Bool[np.ndarray, "frames"]:
+    """The frames that a held-out clip's start is fitted on."""
+    return time <= time[0] + EARLY * (time[-1] - time[0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Foretold:
+    """What one hypothesis says of a held-out clip's later frames.
+
+    Attributes:
+      fit: of its start.
+      energy: mean square error by later frame [noise widths squared].
+      likelihood: logarithm of how likely the later frames were, up to a constant of the clip.
+      floor: root mean square error that noise, and what is not known of the start, would give if all else were right.
+    """
+
+    fit: Fit
+    energy: Float[np.ndarray, "later"]
+    likelihood: float
+    floor: float
+
+    @property
+    def error(self) -> float:
+        """Root mean square over the later frames [noise widths]."""
+        return float(np.sqrt(self.energy.mean()))
+
+
+def foretell(clip: ClipFit, part: Hypothesis, z: Float[np.ndarray, "part"], early: np.ndarray, seed: int) -> Foretold:
+    """Fits a held-out clip's start with the set-up at ``z`` and foretells the rest.
+
+    Args:
+      clip: its residuals; contacts must not have been allowed to err.
+      part: the hypothesis.
+      z: the shared coordinates count, the others do not.
+      early: frames that may be seen.
+      seed: of the hops.
+    """
+    hypothesis = with_frozen_setup(part, z)
+    at = np.zeros(hypothesis.dimension)
+    frames = np.nonzero(early)[0]
+    for share in (0.5, 1.0):
+        keep = early & (np.arange(len(early)) <= frames[max(int(share * len(frames)) - 1, 3)])
+        at = clip.fit(hypothesis, at, 8, keep, FORGIVING).z
+    fit = clip.fit(hypothesis, at, 10, early)
+    if (fit.residual**2).sum() > GOOD * (counts_of(clip) * kept(clip, early)).sum():
+        fit = clip.hop(fit, seed, 2, 48, early)
+    return _foretold(clip, fit, early, seed)
+
+
+def _foretold(clip: ClipFit, fit: Fit, early: np.ndarray, seed: int) -> Foretold:
+    generator = np.random.default_rng(seed)
+    factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
+    draws = np.clip(fit.z + generator.standard_normal((DRAWS, len(fit.z))) @ factor, *fit.hypothesis.bounds)
+    z = np.concatenate([fit.z[None], draws])
+    prediction = clip.predictor(clip.poses(fit.hypothesis, z), fit.hypothesis.batch(z))
+    counts = counts_of(clip) * kept(clip, ~early)
+    rows = clip.rigid(clip.distances(prediction), None, WIDE) / np.sqrt(np.maximum(counts_of(clip), 1e-12))
+    rows = np.where(counts > 0, rows, 0.0)
+    spread = (
+        np.median((rows[1:][~prediction.bad[1:]] - rows[0]) ** 2, 0) if not prediction.bad[1:].all() else 0 * rows[0]
+    )
+    variance = 1.0 + spread
+    likelihood = -0.5 * float((counts * (rows[0] ** 2 / variance + np.log(variance))).sum())
+    total = max(float(counts.sum()), 1e-9)
+    floor = float(np.sqrt((counts * variance).sum() / total))
+    return Foretold(fit, _by_frame(clip, counts * rows[0] ** 2, counts)[~early], likelihood, floor)
+
+
+def counts_of(clip: ClipFit) -> Float[np.ndarray, "residuals"]:
+    """As how many independent numbers each residual counts; zero where nothing was measured."""
+    parts, fresh = clip.measured.parts, clip.measured.freshness[..., None]
+    seen = Parts(*(np.isfinite(part).astype(float) for part in parts))
+    seen = seen._replace(reach=seen.reach * fresh, moments=seen.moments * fresh)
+    weighed = Parts(*(count * part for count, part in zip(clip.counts.of(parts), seen, strict=True)))
+    weight = getattr(clip, "weight", 1.0)
+    return weight * np.concatenate([part.ravel() for part in weighed])
+
+
+def kept(clip: ClipFit, keep: np.ndarray) -> Float[np.ndarray, "residuals"]:
+    """One for the residuals of some frames, zero for the others."""
+    return clip.kept(keep).astype(float)
+
+
+def _by_frame(clip: ClipFit, energy: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, "frames"]:
+    """Mean square of each frame's residuals."""
+    sums = []
+    for row in (energy, counts):
+        parts = clip.measured.split(row)
+        total = parts.reach.sum((1, 2)) + parts.moments.sum((1, 2))
+        total[:-1] += parts.flow.sum((1, 2, 3)) + parts.background.sum((1, 2))
+        sums.append(total)
+    return sums[0] / np.maximum(sums[1], 1e-9)
+
+
+# --- over all judged clips ---------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Outside:
+    """What the base model and another hypothesis leave of held-out clips.
+
+    Attributes:
+      before: by the base model, a clip each.
+      after: by the other.
+    """
+
+    before: tuple[Foretold, ...]
+    after: tuple[Foretold, ...]
+
+    @property
+    def gains(self) -> Float[np.ndarray, "clips"]:
+        """Of likelihood, by clip [natural logarithms]."""
+        return np.array([a.likelihood - b.likelihood for b, a in zip(self.before, self.after, strict=True)])
+
+    @property
+    def numbers(self) -> tuple[float, float, float]:
+        """Medians over clips of the errors before and after, and of the floor [noise widths]."""
+        return middle(self.before), middle(self.after), float(np.median([f.floor for f in (*self.before,)]))
+
+    @property
+    def closed(self) -> float:
+        """(before - after) / (before - floor)."""
+        return _closed(*self.numbers)
+
+    def sure(self, seed: int, share: float = 0.95) -> bool:
+        """Whether the gain is no accident of which clips were judged (bootstrap over them)."""
+        gains = self.gains
+        if len(gains) < FEW:
+            return bool((gains > 0).all())
+        draws = np.random.default_rng(seed).integers(0, len(gains), (BOOTSTRAP, len(gains)))
+        return bool((np.median(gains[draws], 1) > 0).mean() >= share)
+
+    def interval(self, seed: int) -> tuple[float, float]:
+        """90 % bootstrap interval of ``closed``: over clips (Efron 1979), of few over blocks of frames (Kuensch 1989)."""
+        generator, count = np.random.default_rng(seed), len(self.before)
+        pairs = list(zip(self.before, self.after, strict=True))
+        draws = []
+        for _ in range(BOOTSTRAP):
+            if count >= FEW:
+                chosen = [pairs[k] for k in generator.integers(0, count, count)]
+            else:
+                chosen = [_resampled(b, a, generator) for b, a in pairs]
+            draws.append(Outside(*zip(*chosen, strict=True)).closed)
+        low, high = np.quantile(draws, [0.05, 0.95])
+        return float(low), float(high)
+
+
+def middle(told: Sequence[Foretold]) -> float:
+    """Median of the clips' errors."""
+    return float(np.median([f.error for f in told]))
+
+
+def _resampled(before: Foretold, after: Foretold, generator: np.random.Generator) -> tuple[Foretold, Foretold]:
+    count = len(before.energy)
+    blocks = np.array_split(np.arange(count), max(count // BLOCK, 1))
+    rows = np.concatenate([blocks[k] for k in generator.integers(0, len(blocks), len(blocks))])
+    return dataclasses.replace(before, energy=before.energy[rows]), dataclasses.replace(
+        after, energy=after.energy[rows]
+    )
+
+
+def _closed(before: float, after: float, floor: float) -> float:
+    floor = min(floor, before, after)
+    return float(np.clip((before - after) / (before - floor), -1.0, 1.0)) if before - floor > 1e-3 else 0.0

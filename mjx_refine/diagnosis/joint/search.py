@@ -1,0 +1,213 @@
+"""Which effect several clips share: the base model's fit, then every candidate fitted together with it, on the fitted clips."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from mjx_refine.diagnosis.fit import Fit
+from mjx_refine.diagnosis.joint.fit import Clips, JointFit
+from mjx_refine.diagnosis.joint.screen import JointScreen
+from mjx_refine.diagnosis.joint.slack import told_slackness
+from mjx_refine.diagnosis.screen import Lead
+from mjx_refine.diagnosis.search import DOUBT, SECOND_PROMISE, Told, chosen_of, target_name
+from mjx_refine.effects import catalogue
+from mjx_refine.effects.kind import FitView
+
+FAMILIES = 6
+"""Families (effect and target) that are fitted in full, the most promising first."""
+
+RIVALS = 3
+"""Runners-up that are fitted again from where the best effect's fit ended."""
+
+GOOD = 2.5
+"""Mean square residual above which a clip looks for another start by itself."""
+
+PROMISE_OF_PAIRS = 15.0
+"""Lead that an effect needs for a second one to be looked for beside it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JointCandidate:
+    """One effect (or several) fitted together with the base parameters.
+
+    Attributes:
+      fit: where it ended.
+      lead: of its evidence over the base model's, in natural logarithms.
+    """
+
+    fit: JointFit
+    lead: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(t.name for t in self.fit.hypothesis.terms)
+
+    @property
+    def targets(self) -> tuple[int, ...]:
+        return tuple(t.target for t in self.fit.hypothesis.terms)
+
+
+@dataclasses.dataclass(frozen=True)
+class JointCompared:
+    """All hypotheses about the fitted clips.
+
+    Attributes:
+      plain: the base model's fit in which contacts may not err.
+      base: the base model's fit.
+      candidates: single effects, the best evidence first.
+      pairs: two effects, the best evidence first.
+      impacts: how many impacts were allowed slack.
+      slackness: how much, as a multiple of what a clip alone allows.
+    """
+
+    plain: JointFit
+    base: JointFit
+    candidates: tuple[JointCandidate, ...]
+    pairs: tuple[JointCandidate, ...]
+    impacts: int
+    slackness: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """What the search needs to know of the clips beside their residuals.
+
+    Attributes:
+      views: makes what kinds see from a clip's number and its part of a fit.
+      names: of the objects.
+    """
+
+    views: Callable[[int, Fit], FitView]
+    names: tuple[str, ...]
+
+
+def compare_together(
+    clips: Clips, begin: Callable[[], JointFit], seen: Seen, without: Sequence[str], seed: int, told: Told
+) -> JointCompared:
+    """Fits the base model, then what the linear look promises.
+
+    Args:
+      clips: residuals of the fitted clips.
+      begin: makes the base model's first fit.
+      seen: what kinds look at.
+      without: effects that are left out of the catalogue.
+      seed: of random hops.
+      told: called with a line for each step.
+    """
+    told("base model")
+    plain = base = clips.restarted(begin(), seed, GOOD)
+    impacts, slackness = 0, 1.0
+    for _ in range(2):
+        impacts, slackness = _allow(clips, base, slackness, seed)
+        base = clips.restarted(clips.fit(base.hypothesis, base.z, 10), seed, GOOD)
+    names = [name for name in catalogue() if name not in without]
+    base, singles = _singles(clips, base, seen, names, told)
+    pairs = _pairs(clips, base, singles, seen, names, told)
+    return JointCompared(plain, base, singles, pairs, impacts, slackness)
+
+
+def _allow(clips: Clips, base: JointFit, slackness: float, seed: int) -> tuple[int, float]:
+    """Sets noise, chaos and slack of every clip from the base model's fit; (impacts, slackness)."""
+    impacts = 0
+    for c, (clip, part) in enumerate(zip(clips.clips, base.parts, strict=True)):
+        clip.settle_noise(part)
+        hypothesis, z = clips.own(base, c)
+        clip.allow_chaos(clip.at(hypothesis, z), seed)
+        impacts += clip.allow_slack(part)
+    slackness = told_slackness(clips.clips, base.parts)
+    for clip in clips.clips:
+        clip.set_slackness(slackness)
+    return impacts, slackness
+
+
+def _singles(
+    clips: Clips, base: JointFit, seen: Seen, names, told: Told
+) -> tuple[JointFit, tuple[JointCandidate, ...]]:
+    fitted: dict[tuple[str, int], JointFit] = {}
+    for again in range(2):
+        told("looking ahead")
+        for lead in chosen_of(_look(clips, base, seen, names), FAMILIES if again == 0 else 2):
+            told(f"{lead.name} {target_name(seen.names, lead.target)}".strip())
+            _fit_lead(clips, base, lead, fitted)
+        best = max(fitted.values(), key=lambda fit: fit.evidence, default=base)
+        if not fitted:
+            break
+        # What an effect's fit found for the base parameters may serve the base model as well.
+        other = clips.fit(base.hypothesis, best.hypothesis.without_terms(best.z), 8)
+        if other.cost > base.cost - 1.0:
+            break
+        base = other
+    _from_the_best(clips, base, fitted)
+    found = [JointCandidate(fit, _lead(fit, base)) for fit in fitted.values()]
+    return base, tuple(sorted(found, key=lambda c: -c.lead))
+
+
+def _look(clips: Clips, fit: JointFit, seen: Seen, names) -> list[Lead]:
+    views = [seen.views(c, part) for c, part in enumerate(fit.parts)]
+    return JointScreen(clips, fit, views).leads(names)
+
+
+def _lead(fit: JointFit, base: JointFit) -> float:
+    """Of a fit's evidence over the base model's."""
+    return fit.evidence - base.evidence - sum(DOUBT.get(t.name, 0.0) for t in fit.hypothesis.terms)
+
+
+def _fit_lead(clips: Clips, here: JointFit, lead: Lead, fitted: dict) -> None:
+    """Fits a lead from where it was seen, and keeps it where it is the family's best."""
+    one = lead.term(clips.frames)
+    hypothesis = here.hypothesis.added(one)
+    fit = clips.fit(hypothesis, _begin(clips, hypothesis, here, lead, lead.z(one)), 9)
+    if fit.cost > here.cost:
+        # Where the linear look misleads, the effect grows from nothing.
+        fit = clips.fit(hypothesis, hypothesis.grown(here.z, 0 * lead.z(one)), 9)
+    key = (lead.name, lead.target)
+    if key not in fitted or fit.evidence > fitted[key].evidence:
+        fitted[key] = fit
+
+
+def _begin(clips: Clips, hypothesis, here: JointFit, lead: Lead, z: np.ndarray) -> np.ndarray:
+    """Where the fit starts: a part of the way that the linear look points, base parameters and effect together."""
+    parts = (0.0, 0.1, 0.3, 0.6, 1.0) if lead.start.columns else (0.0, 0.3, 1.0)
+    limited = np.clip(lead.shift, -10.0, 10.0)
+    return clips.best_of(hypothesis, np.array([hypothesis.grown(here.z + a * limited, a * z) for a in parts]))
+
+
+def _from_the_best(clips: Clips, base: JointFit, fitted: dict[tuple[str, int], JointFit]) -> None:
+    """Runners-up once more from the base parameters that the best effect's fit found: one basin is fair to all."""
+    ordered = sorted(fitted, key=lambda key: -fitted[key].evidence)
+    best = fitted[ordered[0]] if ordered else base
+    ground = best.hypothesis.without_terms(best.z)
+    for key in ordered[1 : 1 + RIVALS]:
+        fit = fitted[key]
+        if fit.evidence < base.evidence + 0.1 * (best.evidence - base.evidence):
+            break
+        z = fit.z.copy()
+        z[fit.hypothesis.ordinary] = ground
+        again = clips.fit(fit.hypothesis, z, 8)
+        if again.evidence > fit.evidence:
+            fitted[key] = again
+
+
+def _pairs(clips: Clips, base: JointFit, singles, seen: Seen, names, told: Told) -> tuple[JointCandidate, ...]:
+    """Forward selection of a second effect beside the best one."""
+    found: list[JointCandidate] = []
+    for first in singles[:1]:
+        if first.lead < PROMISE_OF_PAIRS:
+            break
+        here = first.fit
+        allowed = [n for n in names if n not in first.names or catalogue()[n].targeted]
+        leads = [lead for lead in _look(clips, here, seen, allowed) if (lead.name, lead.target) != _only(first)]
+        for lead in [x for x in chosen_of(leads, 2, 1) if x.gain > SECOND_PROMISE]:
+            told(f"{first.names[0]} and {lead.name}")
+            one = lead.term(clips.frames)
+            hypothesis = here.hypothesis.added(one)
+            fit = clips.fit(hypothesis, _begin(clips, hypothesis, here, lead, lead.z(one)), 7)
+            found.append(JointCandidate(fit, _lead(fit, base)))
+    return tuple(sorted(found, key=lambda c: -c.lead))
+
+
+def _only(candidate: JointCandidate) -> tuple[str, int]:
+    return candidate.names[0], candidate.targets[0]
