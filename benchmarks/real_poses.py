@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import dataclasses
 import math
 import sys
 import time
@@ -111,10 +112,13 @@ def _common(told: Diagnosis) -> str:
     )
 
 
-def tosses_together(folder: Path, count: int | None, out: Path, seed: int) -> None:
+def tosses_together(folder: Path, count: int | None, out: Path, seed: int, stiffness: float) -> None:
     """Prints candidates and a row a toss of one diagnosis of all."""
     recordings = [toss(path) for path in sorted(folder.glob("toss_*.npz"))[:count]]
-    told = diagnose_poses(cube(), recordings, seed=seed, told=shown)
+    scene = cube()
+    damping = scene.objects[0].damping * math.sqrt(stiffness / scene.objects[0].stiffness)
+    hard = dataclasses.replace(scene.objects[0], stiffness=stiffness, damping=damping)
+    told = diagnose_poses(dataclasses.replace(scene, objects=(hard,)), recordings, seed=seed, told=shown)
     write_diagnosis(out / "tosses", told, None, {"poses": [one.source for one in recordings], "seed": seed})
     summary(told)
     scene = told.base.objects[0]
@@ -260,16 +264,16 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/real_poses"))
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--together", action="store_true", help="all tosses, or all drops of a ball, in one diagnosis")
+    parser.add_argument("--stiffness", type=float, default=5000.0, help="of contacts, 1/s^2, with --together tosses")
     arguments = parser.parse_args()
     print(f"{machine()}\n")
-    runs = {
-        ("tosses", False): tosses,
-        ("drops", False): drops,
-        ("tosses", True): tosses_together,
-        ("drops", True): drops_together,
-    }
-    run = runs[arguments.what, arguments.together]
-    run(arguments.folder, arguments.count, arguments.out, arguments.seed)
+    call = (arguments.folder, arguments.count, arguments.out, arguments.seed)
+    if arguments.together and arguments.what == "tosses":
+        tosses_together(*call, arguments.stiffness)
+    elif arguments.together:
+        drops_together(*call)
+    else:
+        (tosses if arguments.what == "tosses" else drops)(*call)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,13 @@ RESULTS = ("diagnosed.yaml", "report.html", "diagnosis.json")
 @click.option(
     "--video", type=_PATH, multiple=True, help="Its clip (npz); give --init and --video again for another clip."
 )
-@click.option("--poses", type=_PATH, multiple=True, help="Measured poses (npz with time, pos, quat) instead of a clip.")
+@click.option(
+    "--poses",
+    type=_PATH,
+    multiple=True,
+    help="Measured poses (npz with time, pos, quat) instead of a clip; of several recordings give one each, and one --init "
+    "for all or one each.",
+)
 @click.option("--out", type=_PATH, required=True, help="Folder for the results.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Of everything random.")
 @click.option("--without", multiple=True, metavar="EFFECT", help="An effect to leave out; may be given again.")
@@ -38,6 +44,10 @@ def diagnose(context: click.Context, init, video, poses, out: Path, seed: int, w
     refine diagnose --init refined.yaml --video flows.npz --out diagnosis
 
     refine diagnose --init scene.yaml --poses poses.npz --out diagnosis
+
+    Several clips or recordings of one set-up share objects, effects and camera; some are fitted, the others judged:
+
+    refine diagnose --init scene.yaml --poses a.npz --poses b.npz --poses c.npz --out diagnosis
     """
     _check_call(context, init, video, poses)
     withheld = _withheld(without)
@@ -75,9 +85,10 @@ def _check_call(context: click.Context, init: Sequence[Path], video: Sequence[Pa
         raise click.UsageError("--poses and --video: expected one of them; leave one out", ctx=context)
     if not poses and not video:
         raise click.UsageError("Missing option '--video' (or '--poses')", ctx=context)
-    if poses and (len(init) != 1 or len(poses) != 1):
+    if poses and len(init) not in (1, len(poses)):
         raise click.UsageError(
-            f"{len(init)} --init and {len(poses)} --poses; expected one of each; diagnose each recording by itself",
+            f"{len(init)} --init and {len(poses)} --poses; expected one of each, in the same order, or one --init for all; "
+            "leave some out",
             ctx=context,
         )
     if not poses and len(init) != len(video):
@@ -150,7 +161,8 @@ class Inputs:
                 state.update(hashlib.file_digest(stream, "sha256").digest())
         call: dict[str, Any] = {"init": [path.name for path in self.init], "video": [path.name for path in self.video]}
         if self.poses:
-            call["poses"] = self.poses[0].name
+            names = [path.name for path in self.poses]
+            call["poses"] = names[0] if len(names) == 1 else names
         return {**call, "seed": seed, "without": list(without), "digest": state.hexdigest()}
 
 
@@ -181,7 +193,10 @@ def _diagnosed(inputs: Inputs, call: dict[str, Any], without, seed: int, threads
 
     options = {"without": without, "seed": seed, "threads": threads, "told": told}
     if inputs.poses:
-        return diagnosis.diagnose_poses(_only(inputs.samples[0]), inputs.recorded[0], **options), call, None
+        scenes = [_only(samples) for samples in inputs.samples]
+        if len(inputs.recorded) == 1:
+            return diagnosis.diagnose_poses(scenes[0], inputs.recorded[0], **options), call, None
+        return diagnosis.diagnose_poses(scenes, list(inputs.recorded), **options), call, None
     several = len(inputs.observations) > 1
     function = _function(
         diagnosis,

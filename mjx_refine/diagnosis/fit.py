@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -79,6 +80,21 @@ def prior(hypothesis: Hypothesis, z: Float[np.ndarray, "*batch dimension"]) -> t
     return residual, np.where(heavy, np.maximum(slope, 0.1), 1.0)
 
 
+@dataclasses.dataclass(frozen=True)
+class Loose:
+    """What may be off without being blamed.
+
+    Attributes:
+      always: whatever contacts do, one standard deviation a row.
+      kicks: errors of contacts, one standard deviation a row, or None.
+      blurred: the noise with what the uncertain moment of impacts adds, times a factor.
+    """
+
+    always: Parts
+    kicks: Parts | None
+    blurred: Callable[[float], Noise]
+
+
 class ClipFit:
     """Residuals and least squares for one clip.
 
@@ -99,36 +115,43 @@ class ClipFit:
         self.rollouts = 0.0
         self.counts = Counts()
         self.slackness = 1.0
+        self._loose: Loose | None = None
         self._columns: np.ndarray | None = None
-        self._kicks = 0
         self._slacks: dict[bytes | None, Slack] = {}
 
     def allow_slack(self, fit: Fit) -> int:
-        """Lets contacts of a base model's fit err from now on, and masks be a little wide; returns how many impacts there
-        are."""
+        """Lets contacts of a base model's fit err, and masks be a little wide; returns how many impacts there are."""
         batch = fit.hypothesis.batch(fit.z[None])
         poses = self.poses(fit.hypothesis, fit.z[None])[0]
-        self._columns, self._slacks = None, {}
+        self._loose, self._columns, self._slacks = None, None, {}
         if not np.isfinite(poses).all():
             return 0
         still = self.predictor(poses[None], batch)
         found = impacts(batch, poses, self.simulator.fps)
-        self.noise = blurred(self.noise, still.moments[0], [(i.target, i.frame) for i in found])
+        sharp = self.noise
         long = sustained(batch, poses, touching(batch, poses), self.simulator.fps)
-        columns = [self.whitened(self._wide(), None, 1e9)]
+        kicks = None
         if found or long:
             rows = kicked(self.simulator, batch, poses, [*found, *long])
             self.rollouts += len(rows)
             many = batch.map(lambda a: np.repeat(a[:1], len(rows), 0))
             moved = self.predictor(rows, many)
-            columns.append(self.whitened(self._change(moved, still), None, 1e9)[~moved.bad])
-        self._set_columns(columns)
+            kicks = Parts(*(part[~moved.bad] for part in self._change(moved, still)))
+        marks = [(i.target, i.frame) for i in found]
+        self._loose = Loose(self._wide(), kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
+        self.set_slackness(self.slackness)
         return len(found)
 
-    def _set_columns(self, columns: list[np.ndarray]) -> None:
-        """What may err by one standard deviation: rows that always may, then those of contacts."""
-        self._columns, self._slacks = np.concatenate(columns).T, {}
-        self._kicks = len(columns[0])
+    def set_slackness(self, slackness: float) -> None:
+        """How much contacts may err, as a multiple of what they may in one clip alone."""
+        self.slackness, self._slacks = slackness, {}
+        if self._loose is None:
+            return
+        self.noise = self._loose.blurred(slackness)
+        columns = [self.rigid(self._loose.always, None, 1e9)]
+        if self._loose.kicks is not None and slackness > 0:
+            columns.append(self.rigid(self._loose.kicks, None, 1e9 / slackness) * slackness)
+        self._columns = np.concatenate(columns).T
 
     def _change(self, moved: Prediction, still: Prediction) -> Parts:
         """From one prediction to others [px], zero where nothing was measured."""
@@ -184,20 +207,15 @@ class ClipFit:
             return None
         key = None if keep is None else keep.tobytes()
         if key not in self._slacks:
-            columns = self.slack_columns(self.slackness)
-            self._slacks[key] = slack_of(columns if keep is None else columns * self.kept(keep)[:, None])
+            columns = self._columns if keep is None else self._columns * self.kept(keep)[:, None]
+            self._slacks[key] = slack_of(columns)
         return self._slacks[key]
 
-    def slack_columns(self, slackness: float) -> Float[np.ndarray, "residuals columns"]:
-        """What the residuals may err by, one standard deviation a column, with contacts that err so many times as much."""
-        if self._columns is None:
-            return np.zeros((sum(part.size for part in self.measured.parts), 0))
-        scale = np.where(np.arange(self._columns.shape[1]) < self._kicks, 1.0, slackness)
-        return self._columns if slackness == 1.0 else self._columns * scale
-
-    def set_slackness(self, slackness: float) -> None:
-        """How much contacts may err, as a multiple of what they may in one clip alone."""
-        self.slackness, self._slacks = slackness, {}
+    @property
+    def slack_columns(self) -> Float[np.ndarray, "residuals columns"]:
+        """What the residuals may err by, one standard deviation a column."""
+        size = sum(part.size for part in self.measured.parts)
+        return np.zeros((size, 0)) if self._columns is None else self._columns
 
     def kept(self, keep: np.ndarray) -> np.ndarray:
         """Which residuals belong to kept frames."""
@@ -228,16 +246,22 @@ class ClipFit:
         white, slack = self.rigid(distances, keep, scale), self._slack(keep)
         return white if slack is None else slack(white)
 
+    @property
+    def widths(self) -> Parts:
+        """Standard deviations of each part, to be broadcast [px]."""
+        noise, slow = self.noise, self.measured.freshness[:, :, None] ** -0.5
+        return Parts(
+            noise.edge[:, :, None] * slow, noise.flow[:, :, None, None], noise.moments * slow, noise.background
+        )
+
     def rigid(
         self, distances: Parts, keep: Bool[np.ndarray, "frames"] | None, scale: float
     ) -> Float[np.ndarray, "batch residuals"]:
         """As ``whitened``, but nothing excuses what contacts err by."""
-        noise, counts = self.noise, self.counts.of(distances)
-        slow = self.measured.freshness[:, :, None] ** -0.5
-        widths = (noise.edge[:, :, None] * slow, noise.flow[:, :, None, None], noise.moments * slow, noise.background)
+        counts = self.counts.of(distances)
         parts = [
             slowed(np.nan_to_num(raw) / sigma, scale * patience) * np.sqrt(count)
-            for raw, sigma, count, patience in zip(distances, widths, counts, PATIENCE, strict=True)
+            for raw, sigma, count, patience in zip(distances, self.widths, counts, PATIENCE, strict=True)
         ]
         white = Parts(*parts).flat()
         return white if keep is None else white * self.kept(keep)

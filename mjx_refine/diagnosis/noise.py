@@ -123,20 +123,23 @@ def settled(measured: Measured, residual: Parts, counts: Counts) -> tuple[Measur
     return settled_ones, Counts(edge_count, flow_count)
 
 
-def blurred(noise: Noise, moments: Float[np.ndarray, "frames objects 3"], impacts: list[tuple[int, int]]) -> Noise:
+def blurred(
+    noise: Noise, moments: Float[np.ndarray, "frames objects 3"], impacts: list[tuple[int, int]], factor: float = 1.0
+) -> Noise:
     """The noise with what the uncertain moment of impacts adds, in the frames around them.
 
     Args:
       noise: standard deviations.
       moments: predicted centroids and radii [px].
       impacts: (object, first frame after) of each.
+      factor: of how uncertain it is.
     """
     edge, flow, whole = noise.edge.copy(), noise.flow.copy(), noise.moments.copy()
     bend = np.zeros_like(moments)
     bend[1:-1] = np.abs(np.nan_to_num(np.diff(moments, 2, axis=0)))
     for n, frame in impacts:
         near = slice(max(frame - 2, 0), frame + 2)
-        off = BLUR * bend[near, n].max(0, initial=0.0)
+        off = factor * BLUR * bend[near, n].max(0, initial=0.0)
         whole[near, n] = np.hypot(whole[near, n], off)
         size = float(np.linalg.norm(off))
         edge[near, n] = np.hypot(edge[near, n], size)

@@ -10,7 +10,7 @@ from typing import Any
 
 from mjx_fitness import UNMATCHED
 
-from mjx_refine.diagnosis.result import CHANNELS, Diagnosis, Gap, Ranked
+from mjx_refine.diagnosis.result import CHANNELS, ClipGap, Diagnosis, Gap, Place, Ranked
 from mjx_refine.report.numbers import plain
 
 FORMAT = 1
@@ -36,8 +36,7 @@ def diagnosis_numbers(diagnosis: Diagnosis, call: Mapping[str, Any] | None = Non
         },
         "gap": _gap(diagnosis.gap),
         "where": [
-            {**dataclasses.asdict(place), "share": _rounded(max(0.0, place.share), 4)}
-            for place in _sorted_places(diagnosis)
+            {**_place(place), "share": _rounded(max(0.0, place.share), 4)} for place in _sorted_places(diagnosis)
         ],
         "candidates": [_candidate(one) for one in diagnosis.candidates],
         "residual": {"description": diagnosis.residual, "remaining": diagnosis.remaining},
@@ -56,6 +55,8 @@ def diagnosis_numbers(diagnosis: Diagnosis, call: Mapping[str, Any] | None = Non
         "seconds": _rounded(diagnosis.seconds, 2),
         "rollouts": diagnosis.rollouts,
     }
+    if diagnosis.clips:
+        numbers["clips"] = [_clip(one) for one in diagnosis.clips]
     if call is not None:
         numbers["call"] = dict(call)
     return plain(numbers)
@@ -68,6 +69,18 @@ def diagnosis_json(diagnosis: Diagnosis, call: Mapping[str, Any] | None = None) 
 
 def _sorted_places(diagnosis: Diagnosis):
     return sorted(diagnosis.where, key=lambda place: -place.share)
+
+
+def _place(place: Place) -> dict[str, Any]:
+    """Without the clip where there is but one."""
+    return {name: value for name, value in dataclasses.asdict(place).items() if name != "clip" or value is not None}
+
+
+def _clip(one: ClipGap) -> dict[str, Any]:
+    """What is not known of a clip is left out."""
+    values = dataclasses.asdict(one)
+    numbers = {k: _significant(v, _DIGITS) for k, v in values.items() if isinstance(v, float) and math.isfinite(v)}
+    return {"source": one.source, "role": "fitted" if one.fitted else "judged", **numbers}
 
 
 def _gap(gap: Gap) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from mjx_refine.report import encode, plots, tables
 from mjx_refine.report.contours import Overlay, colour, fitted, pale
 from mjx_refine.report.diagnosis_plots import CHANNEL_COLOURS, Rows, gap_bars, misfit_map, top_of
 from mjx_refine.report.diagnosis_replay import replay
-from mjx_refine.report.diagnosis_tables import candidate_rows, gap_tiles, percent, width
+from mjx_refine.report.diagnosis_tables import candidate_rows, clip_rows, gap_tiles, percent, width
 from mjx_refine.report.page import duration
 from mjx_refine.search.result import Replay
 
@@ -64,6 +64,7 @@ def diagnosis_page(
         residual=diagnosis.residual,
         remaining=diagnosis.remaining,
         candidates=candidate_rows(diagnosis),
+        clips=clip_rows(diagnosis),
         notes=diagnosis.notes,
         run=_run(diagnosis, call),
         changed=changed,
@@ -95,8 +96,10 @@ def _environment() -> jinja2.Environment:
 
 def _source(observation: Observation | None, call: Mapping[str, Any] | None) -> str:
     if observation is not None:
-        return Path(observation.source).name
-    return Path(str((call or {}).get("poses", "measured poses"))).name
+        video = (call or {}).get("video") or ()
+        return f"{len(video)} clips" if len(video) > 1 else Path(observation.source).name
+    poses = (call or {}).get("poses", "measured poses")
+    return f"{len(poses)} recordings" if isinstance(poses, list | tuple) else Path(str(poses)).name
 
 
 def _run(diagnosis: Diagnosis, call: Mapping[str, Any] | None) -> list[tuple[str, str]]:

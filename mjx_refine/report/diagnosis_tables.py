@@ -128,6 +128,41 @@ def candidate_rows(diagnosis: Diagnosis) -> list[CandidateRow]:
     return rows
 
 
+@dataclasses.dataclass(frozen=True)
+class ClipRow:
+    """One of several clips as text."""
+
+    source: str
+    role: str
+    before: str
+    after: str
+    floor: str
+    position: str
+    rotation: str
+
+
+def clip_rows(diagnosis: Diagnosis) -> list[ClipRow]:
+    """A row a clip of a set-up, in the call's order."""
+
+    def both(before: float, after: float, factor: float) -> str:
+        if not math.isfinite(before):
+            return "–"
+        return f"{number(factor * before, 3)} → {number(factor * after, 3)}"
+
+    return [
+        ClipRow(
+            source=one.source,
+            role="fitted" if one.fitted else "judged",
+            before=number(one.before, 3),
+            after=number(one.after, 3),
+            floor=number(one.noise_floor, 3),
+            position=both(one.position_before, one.position_after, 1e3),
+            rotation=both(one.rotation_before, one.rotation_after, math.degrees(1.0)),
+        )
+        for one in diagnosis.clips
+    ]
+
+
 def _row(one: Ranked, chosen: bool) -> CandidateRow:
     values = [_value(name, value) for name, value in one.parameters.items()]
     more = len(values) - _MOST_VALUES if len(values) > _MOST_VALUES + 1 else 0

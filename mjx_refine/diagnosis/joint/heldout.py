@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import BLOCK
 from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.joint.counts import counts_of
 from mjx_refine.diagnosis.joint.hypothesis import with_frozen_setup
-from mjx_refine.diagnosis.measure import Parts
 
 EARLY = 0.4
 """Part of a held-out clip on which its start is fitted."""
@@ -90,7 +90,7 @@ def foretell(clip: ClipFit, part: Hypothesis, z: Float[np.ndarray, "part"], earl
         keep = early & (np.arange(len(early)) <= frames[max(int(share * len(frames)) - 1, 3)])
         at = clip.fit(hypothesis, at, 8, keep, FORGIVING).z
     fit = clip.fit(hypothesis, at, 10, early)
-    if (fit.residual**2).sum() > GOOD * (counts_of(clip) * kept(clip, early)).sum():
+    if (fit.residual**2).sum() > GOOD * (counts_of(clip) * clip.kept(early)).sum():
         fit = clip.hop(fit, seed, 2, 48, early)
     return _foretold(clip, fit, early, seed)
 
@@ -101,7 +101,7 @@ def _foretold(clip: ClipFit, fit: Fit, early: np.ndarray, seed: int) -> Foretold
     draws = np.clip(fit.z + generator.standard_normal((DRAWS, len(fit.z))) @ factor, *fit.hypothesis.bounds)
     z = np.concatenate([fit.z[None], draws])
     prediction = clip.predictor(clip.poses(fit.hypothesis, z), fit.hypothesis.batch(z))
-    counts = counts_of(clip) * kept(clip, ~early)
+    counts = counts_of(clip) * clip.kept(~early)
     rows = clip.rigid(clip.distances(prediction), None, WIDE) / np.sqrt(np.maximum(counts_of(clip), 1e-12))
     rows = np.where(counts > 0, rows, 0.0)
     spread = (
@@ -112,21 +112,6 @@ def _foretold(clip: ClipFit, fit: Fit, early: np.ndarray, seed: int) -> Foretold
     total = max(float(counts.sum()), 1e-9)
     floor = float(np.sqrt((counts * variance).sum() / total))
     return Foretold(fit, _by_frame(clip, counts * rows[0] ** 2, counts)[~early], likelihood, floor)
-
-
-def counts_of(clip: ClipFit) -> Float[np.ndarray, "residuals"]:
-    """As how many independent numbers each residual counts; zero where nothing was measured."""
-    parts, fresh = clip.measured.parts, clip.measured.freshness[..., None]
-    seen = Parts(*(np.isfinite(part).astype(float) for part in parts))
-    seen = seen._replace(reach=seen.reach * fresh, moments=seen.moments * fresh)
-    weighed = Parts(*(count * part for count, part in zip(clip.counts.of(parts), seen, strict=True)))
-    weight = getattr(clip, "weight", 1.0)
-    return weight * np.concatenate([part.ravel() for part in weighed])
-
-
-def kept(clip: ClipFit, keep: np.ndarray) -> Float[np.ndarray, "residuals"]:
-    """One for the residuals of some frames, zero for the others."""
-    return clip.kept(keep).astype(float)
 
 
 def _by_frame(clip: ClipFit, energy: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, "frames"]:

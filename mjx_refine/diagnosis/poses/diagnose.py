@@ -119,6 +119,11 @@ def columns_of(scene: Scene, poses: Poses) -> tuple[int, ...]:
 
 
 def check_poses(scene: Scene, poses: Poses) -> None:
+    """Refuses scenes with effects, and recordings that are too short or too long.
+
+    Raises:
+      InputError: what is wrong and what to do.
+    """
     if scene.effects:
         raise InputError(
             f"scene: it has an effect already ({scene.effects[0].effect}); a diagnosis starts from the base model; remove "
@@ -138,6 +143,11 @@ def check_poses(scene: Scene, poses: Poses) -> None:
 
 
 def check_motion(clip: PosesFit, poses: Poses) -> None:
+    """Refuses recordings in which nothing moves.
+
+    Raises:
+      InputError: positions and orientations change by less than their noise.
+    """
     m = clip.measured
     place = (np.nanmax(_known(m.moments), 0) - np.nanmin(_known(m.moments), 0)) / m.moment_noise
     turn = np.arccos(np.clip(np.abs(np.nanmin(_known(_turned(clip)), 0)), 0.0, 1.0)) * 2 / m.edge_noise
@@ -280,6 +290,7 @@ def _notes(
 
 
 def noise_words(clip: PosesFit) -> str:
+    """How long a simulated frame is, and how noisy the measurement."""
     m = clip.measured
     source = "as stated" if m.stated else "from third differences in time; of smoothed poses that is too little"
     moved = m.moment_noise[np.isfinite(m.moments).any(0)]
@@ -290,6 +301,7 @@ def noise_words(clip: PosesFit) -> str:
 
 
 def words(errors: Errors) -> str:
+    """Errors in metres and degrees."""
     parts = []
     if math.isfinite(errors.position):
         parts.append(f"{errors.position:.2g} m")

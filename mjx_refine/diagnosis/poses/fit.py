@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
-from mjx_refine.diagnosis.fit import SCALE, STEPS, ClipFit, Fit
+from mjx_refine.diagnosis.fit import SCALE, STEPS, ClipFit, Fit, Loose
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import BLUR, Counts, Noise
 from mjx_refine.diagnosis.poses.data import Poses, noise_of, rotation_vector
@@ -164,19 +164,20 @@ class PosesFit(ClipFit):
         """Lets contacts of a base model's fit err from now on; returns how many impacts there are."""
         batch = fit.hypothesis.batch(fit.z[None])
         poses = self.poses(fit.hypothesis, fit.z[None])[0]
-        self._columns, self._slacks = None, {}
+        self._loose, self._columns, self._slacks = None, None, {}
         if not np.isfinite(poses).all():
             return 0
         found, long = self._contacts(batch, poses)
-        self._blur(batch, found)
-        columns = [self.whitened(self._unseen_turns(batch, poses), None, 1e9)]
+        sharp, kicks = self.noise, None
         if found or long:
             still = self.predictor(poses[None], batch)
             rows = kicked(self.simulator, batch, poses, [*found, *long])
             self.rollouts += len(rows)
             moved = self.predictor(rows, batch)
-            columns.append(self.whitened(self._change(moved, still), None, 1e9)[~moved.bad])
-        self._set_columns(columns)
+            kicks = Parts(*(part[~moved.bad] for part in self._change(moved, still)))
+        always = self._unseen_turns(batch, poses)
+        self._loose = Loose(always, kicks, lambda factor: self._blurred(sharp, batch, found, factor))
+        self.set_slackness(self.slackness)
         return len(found)
 
     def _contacts(self, batch: SceneBatch, poses: np.ndarray) -> tuple[list[Impact], list[Impact]]:
@@ -190,15 +191,16 @@ class PosesFit(ClipFit):
         found, long = ([dataclasses.replace(i, frame=min(i.frame * every, last)) for i in part] for part in told)
         return found, long
 
-    def _blur(self, batch: SceneBatch, found: list[Impact]) -> None:
-        """Adds what the uncertain moment of impacts makes of the noise around them."""
-        edge, moments = self.noise.edge.copy(), self.noise.moments.copy()
+    def _blurred(self, sharp: Noise, batch: SceneBatch, found: list[Impact], factor: float) -> Noise:
+        """The noise with what the uncertain moment of impacts makes of it around them."""
+        edge, moments = sharp.edge.copy(), sharp.moments.copy()
         for one in found:
             near = np.abs(self.time - one.frame / self.simulator.fps) < 2.0 / VIDEO
             size = float(batch.size[0, one.target].max())
-            moments[near, one.target] = np.hypot(moments[near, one.target], BLUR / VIDEO * one.change)
-            edge[near, one.target] = np.hypot(edge[near, one.target], BLUR / VIDEO * one.turn / size)
-        self.noise = dataclasses.replace(self.noise, edge=edge, moments=moments)
+            late = factor * BLUR / VIDEO
+            moments[near, one.target] = np.hypot(moments[near, one.target], late * one.change)
+            edge[near, one.target] = np.hypot(edge[near, one.target], late * one.turn / size)
+        return dataclasses.replace(sharp, edge=edge, moments=moments)
 
     def _unseen_turns(self, batch: SceneBatch, poses: np.ndarray) -> Parts:
         """Turns in the body's frame that the space does not hold, a row each: they turn with the body."""
@@ -232,11 +234,15 @@ class PosesFit(ClipFit):
         told = zip(prediction.parts, self.measured.parts, strict=True)
         return Parts(*(np.where(np.isfinite(seen), a - np.nan_to_num(seen), np.nan) for a, seen in told))
 
+    @property
+    def widths(self) -> Parts:
+        """Standard deviations of each part, to be broadcast [rad], [m]."""
+        return Parts(self.noise.edge[:, :, None], 1.0, self.noise.moments, 1.0)
+
     def rigid(
         self, distances: Parts, keep: Bool[np.ndarray, "times"] | None, scale: float = SCALE
     ) -> Float[np.ndarray, "batch residuals"]:
         """Robust residuals in noise widths; zero where nothing was measured, and in samples that are not kept."""
-        widths = (self.noise.edge[:, :, None], 1.0, self.noise.moments, 1.0)
-        raw = [np.nan_to_num(part) / width for part, width in zip(distances, widths, strict=True)]
+        raw = [np.nan_to_num(part) / width for part, width in zip(distances, self.widths, strict=True)]
         white = Parts(*(slowed(part, scale * PATIENCE) for part in raw)).flat() * np.sqrt(self.weight)
         return white if keep is None else white * self.kept(keep)
