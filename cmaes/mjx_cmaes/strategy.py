@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mjx_cmaes.parameters import Parameters, Rates, parameters
-from mjx_cmaes.ranking import failures_last, rank_weights, recombination_weights
+from mjx_cmaes.ranking import Ranking, failures_last, rank_weights, recombination_weights
 from mjx_cmaes.settings import Settings, require
 from mjx_cmaes.state import Info, State, decompose
 from mjx_cmaes.types import Costs, Flags, Matrix, Points, Vector
@@ -25,6 +25,10 @@ MIRROR_CORRECTION = 0.5
 CORRELATION_THRESHOLD = 2.0
 SHRINK_WHEN_ALL_FAIL = 0.8
 WIDEN_WHEN_ALL_TIE = 1.1
+# From so many coordinates on, where a decomposition costs more than the rest of an update, every second generation goes
+# without, if C learns less than STALENESS in two: medians of the benchmark's rows at n = 84 do not tell.
+MANY = 60
+STALENESS = 0.04
 # Floor of σ and of the scales: a collapsed distribution stays finite.
 SMALLEST = 1e-100
 
@@ -54,8 +58,8 @@ def tell(settings: Settings, state: State, points: Points, costs: Costs) -> tupl
     costs = failures_last(costs)
     injected = _injected(state, points)
     state = _record(state, points, costs)
-    finite = np.isfinite(costs)
-    distinct = len(np.unique(costs[finite]))
+    ranking = Ranking.of(costs)
+    finite, distinct = ranking.finite, ranking.distinct
     if not finite.any():
         new = replace(state, sigma=state.sigma * SHRINK_WHEN_ALL_FAIL, failed=state.failed + 1, tied=0)
     elif distinct == 1 and finite.all():
@@ -64,13 +68,13 @@ def tell(settings: Settings, state: State, points: Points, costs: Costs) -> tupl
     else:
         constants = parameters(settings.dimension, len(points), settings.diagonal_acceleration)
         steps = _whiten(state, points, injected if settings.injection_limit else None)
-        new = _update(settings, replace(state, tied=0, failed=0), constants, steps, costs)
+        new = _update(settings, replace(state, tied=0, failed=0), constants, steps, ranking)
     return new, _info(new, costs, distinct, int(injected.sum()))
 
 
-def _update(settings: Settings, state: State, p: Parameters, steps: _Steps, costs: Costs) -> State:
+def _update(settings: Settings, state: State, p: Parameters, steps: _Steps, ranking: Ranking) -> State:
     """Mean, paths, σ, C and S, in the tutorial's order."""
-    attract = recombination_weights(p.positive, costs)
+    attract = recombination_weights(p.positive, ranking)
     mean_y, mean_z = attract @ steps.y, attract @ steps.z  # (T 41)
     mean = state.mean + state.sigma * state.scale * mean_y  # (T 42), c_m = 1
     if settings.bounded:
@@ -88,7 +92,7 @@ def _update(settings: Settings, state: State, p: Parameters, steps: _Steps, cost
 
     path_full = _decay(state.path_full, p.full.c_c, pull)  # (T 45)
     full_weight = _path_weight(state.path_full_weight, p.full, stalled, p.diagonal is None)
-    covariance = _learn_covariance(state, p.full, steps, costs, path_full / state.scale, full_weight)
+    covariance = _learn_covariance(state, p.full, steps, ranking, path_full / state.scale, full_weight)
     new = replace(
         state,
         age=age,
@@ -102,7 +106,7 @@ def _update(settings: Settings, state: State, p: Parameters, steps: _Steps, cost
     if p.diagonal is not None:
         path = _decay(state.path_diagonal, p.diagonal.c_c, pull)
         weight = _path_weight(state.path_diagonal_weight, p.diagonal, stalled, False)
-        scale = _learn_scale(state, p.diagonal, steps, costs, path, weight)
+        scale = _learn_scale(state, p.diagonal, steps, ranking, path, weight)
         new = replace(new, scale=scale, path_diagonal=path, path_diagonal_weight=weight)
     return _decompose_if_due(new, p)
 
@@ -139,28 +143,30 @@ def _path_weight(weight: float, rates: Rates, stalled: bool, plain: bool) -> flo
     return (1 - rates.c_c) ** 2 * weight + (not stalled) * grown
 
 
-def _active(rates: Rates, steps: _Steps, costs: Costs) -> tuple[Costs, float]:
+def _active(rates: Rates, steps: _Steps, ranking: Ranking) -> tuple[Costs, float]:
     """Weights w° with the negative ones scaled by n / ‖z‖² (T 46), and the sum of the weights before."""
-    weights = rank_weights(rates.weights, costs)
+    weights = rank_weights(rates.weights, ranking)
     n = steps.y.shape[1]
     shrink = n / np.maximum(steps.lengths2, 1e-8 * n)
     return np.where(weights >= 0, weights, weights * shrink), float(weights.sum())
 
 
 def _learn_covariance(
-    state: State, rates: Rates, steps: _Steps, costs: Costs, path: Vector, path_weight: float
+    state: State, rates: Rates, steps: _Steps, ranking: Ranking, path: Vector, path_weight: float
 ) -> Matrix:
     """C after the rank-one and the rank-μ update (T 47)."""
-    weights, total = _active(rates, steps, costs)
+    weights, total = _active(rates, steps, ranking)
     keep = 1 - rates.c_1 * path_weight - rates.c_mu * total
     rank_mu = (steps.y.T * weights) @ steps.y
     covariance = keep * state.covariance + rates.c_1 * np.outer(path, path) + rates.c_mu * rank_mu
     return (covariance + covariance.T) / 2
 
 
-def _learn_scale(state: State, rates: Rates, steps: _Steps, costs: Costs, path: Vector, path_weight: float) -> Vector:
+def _learn_scale(
+    state: State, rates: Rates, steps: _Steps, ranking: Ranking, path: Vector, path_weight: float
+) -> Vector:
     """Coordinates' scales after the multiplicative update (D, 3.2), slowed down where correlations are strong."""
-    weights, total = _active(rates, steps, costs)
+    weights, total = _active(rates, steps, ranking)
     path_z = state.basis @ ((state.basis.T @ (path / state.scale)) / state.axes)
     change = rates.c_1 * (path_z**2 - path_weight) + rates.c_mu * (weights @ steps.z**2 - total)
     slow = max(1.0, state.axes.max() / state.axes.min() - CORRELATION_THRESHOLD + 1)
@@ -169,8 +175,7 @@ def _learn_scale(state: State, rates: Rates, steps: _Steps, costs: Costs, path: 
 
 def _decompose_if_due(state: State, p: Parameters) -> State:
     """Renews B and the axes every few generations (T, B.2), and makes C a correlation matrix again (D)."""
-    n = len(state.mean)
-    interval = max(1, int(1 / (10 * n * (p.full.c_1 + p.full.c_mu))))
+    interval = 2 if len(state.mean) >= MANY and 2 * (p.full.c_1 + p.full.c_mu) < STALENESS else 1
     if state.decomposed + 1 < interval:
         return replace(state, decomposed=state.decomposed + 1)
     covariance, scale = state.covariance, state.scale

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mjx_cmaes import Settings, ask, init, tell
 from mjx_cmaes.parameters import parameters
-from mjx_cmaes.ranking import rank_weights, recombination_weights
+from mjx_cmaes.ranking import Ranking, rank_weights, recombination_weights
 from mjx_cmaes.state import State
 from scipy.linalg import sqrtm
 
@@ -170,13 +170,13 @@ def test_random_ranks_hardly_move_sigma(monkeypatch, mirrored, correction, most)
 
 def test_tied_costs_share_their_weights():
     weights = np.array([0.5, 0.3, 0.2, 0.0, -0.4, -0.6])
-    shares = rank_weights(weights, np.array([2.0, 1.0, 2.0, 5.0, 5.0, 5.0]))
+    shares = rank_weights(weights, Ranking.of(np.array([2.0, 1.0, 2.0, 5.0, 5.0, 5.0])))
     np.testing.assert_allclose(shares, [0.25, 0.5, 0.25, -1 / 3, -1 / 3, -1 / 3])
     assert shares.sum() == pytest.approx(weights.sum())
 
 
 def test_failures_never_attract():
-    shares = recombination_weights(np.array([0.6, 0.3, 0.1, 0.0]), np.array([np.inf, np.inf, 3.0, np.inf]))
+    shares = recombination_weights(np.array([0.6, 0.3, 0.1, 0.0]), Ranking.of(np.array([np.inf, np.inf, 3.0, np.inf])))
     np.testing.assert_allclose(shares, [0, 0, 1, 0])
 
 
