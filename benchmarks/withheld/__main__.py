@@ -34,11 +34,12 @@ def main() -> None:
 @click.option("--withheld", type=click.IntRange(0), default=COUNTS["withheld"], show_default=True)
 @click.option("--strange", type=click.IntRange(0), default=COUNTS["strange"], show_default=True)
 @click.option("--only", default="", help="Effects to keep to, parted by commas.")
+@click.option("--clips", type=click.IntRange(1, 9), default=1, show_default=True, help="Of each set-up.")
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True)
-def make(seed: int, out: Path, only: str, jobs: int, **counts: int) -> None:
+def make(seed: int, out: Path, only: str, clips: int, jobs: int, **counts: int) -> None:
     """Makes clips and their keys; those that are there already are left alone."""
     try:
-        listed = plan.orders(seed, counts, tuple(n for n in only.split(",") if n))
+        listed = plan.orders(seed, counts, tuple(n for n in only.split(",") if n), clips)
     except ValueError as error:
         raise click.UsageError(str(error)) from error
     missing = [(i, o) for i, o in enumerate(listed) if not (out / "key" / f"{i:03d}.json").exists()]
@@ -60,11 +61,12 @@ def make(seed: int, out: Path, only: str, jobs: int, **counts: int) -> None:
 @main.command()
 @click.argument("folder", metavar="EXAM", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the answers.")
+@click.option("--alone", is_flag=True, help="Of several clips of a set-up, the first by itself.")
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True)
-def answer(folder: Path, out: Path, jobs: int) -> None:
+def answer(folder: Path, out: Path, alone: bool, jobs: int) -> None:
     """Diagnoses every clip that has no answer yet."""
     failed = 0
-    for result in answers_.answer(folder, out, jobs):
+    for result in answers_.answer(folder, out, jobs, alone=alone):
         failed += result["status"] != 0
         click.echo(f"{result['clip']}: exit {result['status']}, {result['seconds']} s, {result['peak_mb']} MB")
     if failed:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from benchmarks.clips.writing import scene_text
-from benchmarks.withheld import masks, solve, start
+from benchmarks.withheld import masks, several, solve, start
 from benchmarks.withheld.effect import Effect, named
 from benchmarks.withheld.film import Film, measured_flow, paint, picture
 from benchmarks.withheld.solve import FAMILIES, Solved
@@ -30,12 +30,13 @@ ATTEMPTS = 600
 
 @dataclass(frozen=True)
 class Order:
-    """What a clip is to hold: its split, effects, flow (`exact` or `dis`) and seed."""
+    """What a clip is to hold: its split, effects, flow (`exact` or `dis`), seed, and how many clips of the set-up."""
 
     split: str
     effects: tuple[str, ...]
     flow: str
     seed: tuple[int, int]
+    clips: int = 1
 
 
 @dataclass(frozen=True)
@@ -231,18 +232,66 @@ def _pack(stream: BinaryIO, arrays: dict[str, Any]) -> None:
             archive.writestr(zipfile.ZipInfo(f"{name}.npy"), part.getvalue(), zipfile.ZIP_DEFLATED, 1)
 
 
+def others(take: Take, count: int, rng: np.random.Generator) -> list[Take]:
+    """More clips of a take's set-up.
+
+    Raises:
+      ValueError: none passed the filters (the message counts the reasons).
+    """
+    found: list[Take] = []
+    reasons: dict[str, int] = {}
+    for _ in range(several.ATTEMPTS):
+        if len(found) == count:
+            return found
+        told = several.another(rng, take.stage, take.solved)
+        if not isinstance(told, str):
+            stage, solved = told
+            film = stage.film(tuple(s.effect for s in solved))
+            one = Take(stage, film, solved)
+            idle = [s.effect.name for k, s in enumerate(solved) if not _acts(one, k)]
+            told = film_fault(film, stage.entries) or (f"{idle[0]} hardly acts" if idle else "")
+            if not told:
+                found.append(one)
+                continue
+        reasons[told] = reasons.get(told, 0) + 1
+    raise ValueError(f"no {count} more clips in {several.ATTEMPTS} attempts: {reasons}")
+
+
+def find_set_up(order: Order) -> tuple[Take, list[Take], np.random.Generator]:
+    """A clip and the others of its set-up; set-ups that allow no others are drawn again.
+
+    Raises:
+      ValueError: none did.
+    """
+    if order.clips == 1:
+        take, rng = find(order)
+        return take, [], rng
+    for again in range(8):
+        take, rng = find(replace(order, seed=(order.seed[0] + 1000 * again, order.seed[1])))
+        try:
+            return take, others(take, order.clips - 1, rng), rng
+        except ValueError:
+            continue
+    raise ValueError(f"no set-up of {order.clips} clips for {order}")
+
+
 def write_clip(out: Path, number: int, order: Order) -> str:
     """Makes a clip and writes its folder and key (last); returns a line about it."""
     cv2.setNumThreads(1)
-    take, rng = find(order)
+    take, more, rng = find_set_up(order)
     seen = observe(take, order.flow, rng)
     folder, name = out / "clips" / f"{number:03d}", f"{number:03d}.json"
     folder.mkdir(parents=True, exist_ok=True)
     (out / "key").mkdir(exist_ok=True)
     write_atomic(folder / "flows.npz", lambda stream: _pack(stream, seen["arrays"]))
     write_text(folder / "init.yaml", scene_text(start.rough(take.stage.entries, rng)))
+    for k, one in enumerate(more, 2):
+        arrays = observe(one, order.flow, rng)["arrays"]
+        write_atomic(folder / f"flows_{k}.npz", lambda stream, arrays=arrays: _pack(stream, arrays))
+        write_text(folder / f"init_{k}.yaml", scene_text(start.rough(one.stage.entries, rng)))
     withheld = order.effects if order.split == "withheld" else ()
     write_text(folder / "without.txt", "".join(f"{e}\n" for e in withheld))
     write_text(out / "key" / name, json.dumps(key(order, take, seen["mask_ids"]), indent=1) + "\n")
     sizes = ", ".join(f"{s.effect.name} {s.px:.1f} px" for s in take.solved) or "nothing"
-    return f"{number:03d}: {take.stage.kind}, {len(take.film.solids)} objects, {order.flow}, {sizes}"
+    also = "".join("; " + ", ".join(f"{s.px:.1f} px" for s in one.solved) for one in more)
+    return f"{number:03d}: {take.stage.kind}, {len(take.film.solids)} objects, {order.flow}, {sizes}{also}"

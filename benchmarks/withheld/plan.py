@@ -6,16 +6,18 @@ import numpy as np
 
 from benchmarks.withheld.exam import Order
 from benchmarks.withheld.families import CATALOGUE, PAIRS, STRANGE
+from benchmarks.withheld.several import LASTING
 
 SPLITS = ("one", "two", "none", "withheld", "strange")
 
 
-def orders(seed: int, counts: dict[str, int], only: tuple[str, ...] = ()) -> list[Order]:
+def orders(seed: int, counts: dict[str, int], only: tuple[str, ...] = (), clips: int = 1) -> list[Order]:
     """The clips of an exam, shuffled.
 
     Args:
       seed: the same seed gives the same exam. counts: clips of each split. only: effects of the catalogue to keep to
-        (of pairs: those both of whose effects are among them, if there are any).
+        (of pairs: those both of whose effects are among them, if there are any). clips: of each set-up; of several, only
+        effects that last are drawn.
 
     Raises:
       ValueError: an unknown split or effect.
@@ -24,7 +26,7 @@ def orders(seed: int, counts: dict[str, int], only: tuple[str, ...] = ()) -> lis
     if unknown:
         raise ValueError(f"{unknown[0]!r}; expected one of {', '.join([*CATALOGUE, *SPLITS])}")
     rng = np.random.default_rng([seed, 20])
-    names = list(only or CATALOGUE)
+    names = list(only or (CATALOGUE if clips == 1 else LASTING))
     pairs = [p for p in PAIRS if set(p) <= set(names)] or list(PAIRS)
     pools = {
         "one": [(n,) for n in names],
@@ -41,4 +43,4 @@ def orders(seed: int, counts: dict[str, int], only: tuple[str, ...] = ()) -> lis
             drawn += [pool[i] for i in rng.permutation(len(pool))]
         flows = rng.permutation(["exact", "dis"] * ((count + 1) // 2))[:count]
         found += [(split, tuple(e), str(f)) for e, f in zip(drawn[:count], flows, strict=True)]
-    return [Order(*found[i], seed=(seed, int(i))) for i in rng.permutation(len(found))]
+    return [Order(*found[i], seed=(seed, int(i)), clips=clips) for i in rng.permutation(len(found))]

@@ -5,17 +5,23 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from mjx_refine.errors import InputError
 
+if TYPE_CHECKING:
+    from mjx_refine.diagnosis.store import Store
+
 _PATH = click.Path(path_type=Path)
 RESULTS = ("diagnosed.yaml", "report.html", "diagnosis.json")
+UNFINISHED = "unfinished"
+"""Folder in the results' for fits of a run that is not over."""
 
 
 @click.command()
@@ -36,7 +42,7 @@ RESULTS = ("diagnosed.yaml", "report.html", "diagnosis.json")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Of everything random.")
 @click.option("--without", multiple=True, metavar="EFFECT", help="An effect to leave out; may be given again.")
 @click.option("--threads", type=click.IntRange(1, 4096), help="Of the simulation; all cores by default.")
-@click.option("--resume", is_flag=True, help="Do nothing if --out holds the diagnosis of this very call.")
+@click.option("--resume", is_flag=True, help="Go on from what an interrupted run of this very call left in --out.")
 @click.pass_context
 def diagnose(context: click.Context, init, video, poses, out: Path, seed: int, without, threads, resume: bool) -> None:
     """Says what a scene's simulation lacks to replay a clip: where they part, which effect it is, how far it helps.
@@ -60,17 +66,19 @@ def diagnose(context: click.Context, init, video, poses, out: Path, seed: int, w
         click.echo(f"{out / RESULTS[-1]}: the diagnosis of this call is there already; nothing to do")
         return
     remove_stale_parts(out)
+    store = unfinished(out, call["digest"], resume)
     steps = step_display()
     try:
-        diagnosis, call, clip = _diagnosed(inputs, call, withheld, seed, threads, steps.told)
+        diagnosis, call, clip = _diagnosed(inputs, call, withheld, seed, threads, steps.told, store)
         steps.told("report")
         from mjx_refine.report.diagnosis_files import write_diagnosis
 
         write_diagnosis(out, diagnosis, clip, call)
+        store.clear()
     except KeyboardInterrupt:
         steps.close()
-        # A diagnosis has no checkpoint: the words of a refinement would promise one.
-        click.echo("refine: interrupted; run the same call again", err=True)
+        kept = f" with --resume: {store.kept + store.recalled} fits are kept" if store.kept + store.recalled else ""
+        click.echo(f"refine: interrupted; run the same call again{kept}", err=True)
         raise click.exceptions.Exit(1) from None
     finally:
         steps.close()
@@ -187,11 +195,32 @@ def _done(out: Path, digest: str) -> bool:
     return True
 
 
-def _diagnosed(inputs: Inputs, call: dict[str, Any], without, seed: int, threads: int | None, told):
+def unfinished(out: Path, digest: str, resume: bool) -> Store:
+    """Where this call's finished fits are kept: those of an interrupted run of the same call, or none.
+
+    Fits of another call, or of other versions of what makes them, are of no use and removed.
+
+    Args:
+      out: folder of the results.
+      digest: of the call.
+      resume: whether to go on from what is there.
+    """
+    from mjx_refine.diagnosis.store import Store, versions
+
+    folder = out / UNFINISHED
+    key = hashlib.sha256(f"{digest} {versions()}".encode()).hexdigest()[:16]
+    if folder.is_dir():
+        for other in folder.iterdir():
+            if other.is_dir() and not (resume and other.name == key):
+                shutil.rmtree(other, ignore_errors=True)
+    return Store(folder / key)
+
+
+def _diagnosed(inputs: Inputs, call: dict[str, Any], without, seed: int, threads: int | None, told, store):
     """The diagnosis, the call with the samples that were taken, and the clip to show (None with poses)."""
     from mjx_refine import diagnosis
 
-    options = {"without": without, "seed": seed, "threads": threads, "told": told}
+    options = {"without": without, "seed": seed, "threads": threads, "told": told, "store": store}
     if inputs.poses:
         scenes = [_only(samples) for samples in inputs.samples]
         if len(inputs.recorded) == 1:

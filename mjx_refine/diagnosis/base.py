@@ -11,6 +11,7 @@ from mjx_refine import rotations
 from mjx_refine.batch import batch_from_scenes
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.store import remembered
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Body, Scene
 from mjx_refine.search.features import flow_points, outlines
@@ -66,6 +67,25 @@ def _lies_flat(scene: Scene, i: int, body: Body) -> bool:
     level = (up.max() if body.shape == "box" else up[2]) > math.cos(math.radians(1.5))
     spin = rotations.rotate(np.array(body.orientation), np.array(body.angular_velocity))
     return level and abs(gap) < 0.01 and abs(body.linear_velocity[2]) < 0.1 and float(np.abs(spin[:2]).max()) < 0.5
+
+
+def stored_base(clip: ClipFit, space: Space, observation: Observation, masks_of: tuple[int, ...]) -> Fit:
+    """``fit_base``, kept whole: the landing in it keeps nothing."""
+    return _kept_base(_Landed(clip, observation, masks_of), Hypothesis(space))
+
+
+class _Landed:
+    """A clip with what its base model's fit needs, as ``remembered`` wants it."""
+
+    def __init__(self, clip: ClipFit, observation: Observation, masks_of: tuple[int, ...]):
+        self.clip, self.observation, self.masks_of = clip, observation, masks_of
+        self.store, self.state, self.pack, self.unpack = clip.store, clip.state, clip.pack, clip.unpack
+        self.counted, self.count = clip.counted, clip.count
+
+
+@remembered
+def _kept_base(landed: _Landed, hypothesis: Hypothesis) -> Fit:
+    return fit_base(landed.clip, hypothesis.space, landed.observation, landed.masks_of)
 
 
 def fit_base(clip: ClipFit, space: Space, observation: Observation, masks_of: tuple[int, ...]) -> Fit:

@@ -10,16 +10,17 @@ import numpy as np
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import HeldOut, held_out
-from mjx_refine.diagnosis.measure import measure
+from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Value, Verdict
 from mjx_refine.diagnosis.search import Candidate, Compared, compare, view_of
+from mjx_refine.diagnosis.store import Store
 from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, map_of, signs
 from mjx_refine.diagnosis.where import describe, misfit_map, places
 from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Samples, Scene
 from mjx_refine.search.options import Options
-from mjx_refine.search.problem import Problem
+from mjx_refine.search.problem import Problem, Start
 
 LEAST_FRAMES = 9
 """Frames that a clip must have: fewer cannot be held out."""
@@ -42,6 +43,7 @@ def diagnose(
     seed: int = 0,
     threads: int | None = None,
     told: Callable[[str], None] | None = None,
+    store: Store | None = None,
 ) -> Diagnosis:
     """Says where a refined scene and its clip part, which effect parts them, and how far it closes the gap.
 
@@ -52,23 +54,16 @@ def diagnose(
       seed: of everything random.
       threads: of the simulator; all cores by default.
       told: called with a line for each step.
+      store: where finished fits are kept, so that an interrupted call goes on; nowhere by default.
 
     Raises:
       InputError: the scene has effects, does not match the clip, nothing moves, or the clip is too short.
     """
     began = time.monotonic()
-    _check(scene, observation)
     told = told or (lambda line: None)
-    problem = Problem(Samples("<scene>", (scene,), (0,)), observation, Options(threads=threads))
-    start = problem.starts[0]
-    if float(start.scores.iou[0]) < LEAST_IOU:
-        raise InputError(
-            f"{observation.source}: the scene overlaps the clip with an IoU of {float(start.scores.iou[0]):.3f}; expected a "
-            "refined scene of this clip; run `refine --init ... --video ...` first"
-        )
-    measured = measure(observation, problem.columns(start.matching))
-    _check_motion(measured.reach, observation)
+    problem, start, measured = prepared(scene, observation, threads)
     clip = ClipFit(problem.reference(scene.shapes), measured, observation.size, observation.length)
+    clip.store = store or clip.store
     compared = compare(clip, start.scene, observation, start.matching, without, seed, told)
     told("held-out frames")
     best = best_candidate(compared)
@@ -78,6 +73,25 @@ def diagnose(
     said = answer(found, leads)
     told("report")
     return _result(clip, compared, outside, found, said, problem, observation, start.matching, seed, began)
+
+
+def prepared(scene: Scene, observation: Observation, threads: int | None) -> tuple[Problem, Start, Measured]:
+    """The clip with its scene matched to it, and what is measured of it.
+
+    Raises:
+      InputError: the scene has effects, does not match the clip, nothing moves, or the clip is too short.
+    """
+    _check(scene, observation)
+    problem = Problem(Samples("<scene>", (scene,), (0,)), observation, Options(threads=threads))
+    start = problem.starts[0]
+    if float(start.scores.iou[0]) < LEAST_IOU:
+        raise InputError(
+            f"{observation.source}: the scene overlaps the clip with an IoU of {float(start.scores.iou[0]):.3f}; expected a "
+            "refined scene of this clip; run `refine --init ... --video ...` first"
+        )
+    measured = measure(observation, problem.columns(start.matching))
+    _check_motion(measured.reach, observation)
+    return problem, start, measured
 
 
 def _check(scene: Scene, observation: Observation) -> None:

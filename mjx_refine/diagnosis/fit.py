@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mjx_refine.batch import SceneBatch
+from mjx_refine.diagnosis.fitted import Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, settled
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.slack import BIAS, Slack, impacts, kicked, slack_of, sustained, touching
+from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
 from mjx_refine.search.landing import slowed
 from mjx_refine.sim.backends import Simulator
 
 STEPS = (0.002, 0.02, 0.2)
 """Of finite differences, in prior widths: the first follows what is smooth, the others see over the jags of contacts, and
 are tried where it leads no further."""
-
-TAIL = 2.0
-"""Prior widths beyond which moving a base parameter costs ever less: half its price is TAIL^2 log(1 + (z / TAIL)^2)."""
 
 DAMPINGS = np.array([0.03, 0.3, 1.0, 10.0, 100.0])
 
@@ -35,49 +35,6 @@ PATIENCE = Parts(1.0, 1.0, 6.0, 1.0)
 
 DRAWS = 12
 """Pairs of rollouts that measure chaos."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Fit:
-    """Where least squares ended.
-
-    Attributes:
-      hypothesis: what was fitted.
-      z: the point.
-      cost: half the sum of squares, with the prior.
-      data: ditto without the prior.
-      jacobian: of the residuals.
-      residual: at the point, in noise widths times the root of their weight.
-      evidence: logarithm of the hypothesis' probability, up to a constant of the clip (Laplace; MacKay 2003, ch. 28).
-    """
-
-    hypothesis: Hypothesis
-    z: Float[np.ndarray, "dimension"]
-    cost: float
-    data: float
-    jacobian: Float[np.ndarray, "residuals dimension"]
-    residual: Float[np.ndarray, "residuals"]
-    evidence: float
-
-    @property
-    def gradient(self) -> Float[np.ndarray, "dimension"]:
-        """Of the cost."""
-        price, slope = prior(self.hypothesis, self.z)
-        return self.jacobian.T @ self.residual + slope * price
-
-    @property
-    def curvature(self) -> Float[np.ndarray, "dimension dimension"]:
-        """Of the cost, by Gauss and Newton."""
-        return self.jacobian.T @ self.jacobian + np.diag(prior(self.hypothesis, self.z)[1] ** 2)
-
-
-def prior(hypothesis: Hypothesis, z: Float[np.ndarray, "*batch dimension"]) -> tuple[np.ndarray, np.ndarray]:
-    """The prior as residuals, and their derivatives in z: heavy-tailed for base parameters, normal for effects'."""
-    heavy = hypothesis.ordinary
-    residual = np.where(heavy, slowed(z, TAIL), z)
-    square = (z / TAIL) ** 2
-    slope = np.where(np.abs(z) > 1e-6, np.abs(z) / np.maximum((1 + square) * np.abs(residual), 1e-12), 1.0)
-    return residual, np.where(heavy, np.maximum(slope, 0.1), 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,10 +71,41 @@ class ClipFit:
         self.predictor = Predictor(simulator.shapes, measured.pixels, measured.places, image, simulator.fps)
         self.rollouts = 0.0
         self.counts = Counts()
+        self.store = Store()
         self.slackness = 1.0
         self._loose: Loose | None = None
         self._columns: np.ndarray | None = None
         self._slacks: dict[bytes | None, Slack] = {}
+
+    # --- what is kept of fits ---------------------------------------------------------------------------------------
+    def state(self) -> str:
+        """A fingerprint of all but the hypothesis that residuals depend on."""
+        noise = (self.noise.edge, self.noise.flow, self.noise.moments, self.noise.background)
+        loose = self._columns if self._columns is not None else "rigid"
+        return fingerprint(self.facts, noise, (self.counts.edge, self.counts.flow), loose)
+
+    @functools.cached_property
+    def facts(self) -> str:
+        """A fingerprint of the clip."""
+        return fingerprint(
+            tuple(self.measured.parts), self.measured.pixels, self.image, self.frames, self.simulator.fps
+        )
+
+    def pack(self, fit: Fit) -> Arrays:
+        """What a store keeps of a fit."""
+        return packed(fit, "")
+
+    def unpack(self, hypothesis: Hypothesis, arrays: Arrays) -> Fit:
+        """The fit again."""
+        return unpacked(hypothesis, arrays, "")
+
+    def counted(self) -> np.ndarray:
+        """Rollouts so far."""
+        return np.array([self.rollouts])
+
+    def count(self, more: np.ndarray) -> None:
+        """Counts rollouts that an interrupted run made."""
+        self.rollouts += float(more[0])
 
     def allow_slack(self, fit: Fit) -> int:
         """Lets contacts of a base model's fit err, and masks be a little wide; returns how many impacts there are."""
@@ -313,6 +301,7 @@ class ClipFit:
         return (change / step[:, None]).T
 
     # --- least squares --------------------------------------------------------------------------------------------
+    @remembered
     def fit(self, hypothesis: Hypothesis, z: np.ndarray, iterations: int = 12, keep=None, scale: float = SCALE) -> Fit:
         """Levenberg-Marquardt from ``z``."""
         low, high = hypothesis.bounds
@@ -355,6 +344,7 @@ class ClipFit:
         points = np.clip(points, low, high)
         return points[int(np.argmin(self.residuals(hypothesis, points, keep)[1]))]
 
+    @remembered
     def hop(self, fit: Fit, seed: int, rounds: int = 3, count: int = 64, keep=None, scale: float = SCALE) -> Fit:
         """Least squares again from better points around its end.
 

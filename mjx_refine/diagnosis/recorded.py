@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from mjx_refine.diagnosis.joint.recordings import diagnose_recordings
 from mjx_refine.diagnosis.poses import Poses, diagnose_recording
 from mjx_refine.diagnosis.result import Diagnosis
+from mjx_refine.diagnosis.store import Store
 from mjx_refine.scene import Scene
 
 
@@ -18,6 +19,7 @@ def diagnose_poses(
     seed: int = 0,
     threads: int | None = None,
     told: Callable[[str], None] | None = None,
+    store: Store | None = None,
 ) -> Diagnosis:
     """Says where a scene's simulation and measured poses part, which effect parts them, and how far it closes the gap.
 
@@ -30,6 +32,7 @@ def diagnose_poses(
       seed: of everything random.
       threads: of the simulator; all cores by default.
       told: called with a line for each step.
+      store: where finished fits are kept, so that an interrupted call goes on; nowhere by default.
 
     Raises:
       InputError: the scene has effects, the names do not match, nothing moves, or there are too few samples; of several,
@@ -38,5 +41,7 @@ def diagnose_poses(
     scenes = (scene,) if isinstance(scene, Scene) else tuple(scene)
     recordings = (poses,) if isinstance(poses, Poses) else tuple(poses)
     if len(scenes) == 1 and len(recordings) == 1:
-        return diagnose_recording(scenes[0], recordings[0], without=without, seed=seed, threads=threads, told=told)
-    return diagnose_recordings(scenes, recordings, without=without, seed=seed, threads=threads, told=told)
+        return diagnose_recording(
+            scenes[0], recordings[0], without=without, seed=seed, threads=threads, told=told, store=store
+        )
+    return diagnose_recordings(scenes, recordings, without=without, seed=seed, threads=threads, told=told, store=store)

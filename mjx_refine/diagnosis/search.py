@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
-from mjx_refine.diagnosis.base import base_space, fit_base
+from mjx_refine.diagnosis.base import base_space, stored_base
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.screen import Lead, Screen, term_of
 from mjx_refine.diagnosis.slack import spins, touching
@@ -112,7 +112,7 @@ def compare(
       begin: makes the base model's first fit, where not pictures but poses were measured.
     """
     told("base model")
-    base = begin() if begin is not None else fit_base(clip, base_space(scene), observation, masks_of)
+    base = begin() if begin is not None else stored_base(clip, base_space(scene), observation, masks_of)
     clip.settle_noise(base)
     clip.allow_chaos(base, seed)
     impacts = clip.allow_slack(base)

@@ -176,9 +176,9 @@ BAD = {
         [*CALL[:3], "--init", "scene.yaml", "--poses", "flows.npz", "--out", "out"],
         "2 --init and 1 --poses; expected one of each",
     ),
-    "two scenes and two poses": (
-        [*CALL[:3], "--poses", "p.npz", "--init", "scene.yaml", "--poses", "p.npz", "--out", "out"],
-        "2 --init and 2 --poses; expected one of each; diagnose each recording by itself",
+    "two scenes and three poses": (
+        [*CALL[:3], *("--poses", "p.npz") * 3, "--init", "scene.yaml", "--out", "out"],
+        "2 --init and 3 --poses; expected one of each, in the same order, or one --init for all",
     ),
     "clips of the future": (
         [*CALL, "--init", "scene.yaml", "--video", "flows.npz"],

@@ -13,6 +13,7 @@ from mjx_refine.diagnosis.fit import DAMPINGS, SCALE, STEPS, ClipFit, Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.joint.arrow import Arrow
 from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis, with_frozen_setup
+from mjx_refine.diagnosis.store import Arrays, fingerprint, packed, remembered, unpacked
 from mjx_refine.effects import acting
 
 Keeps = Sequence[Bool[np.ndarray, "frames"]] | None
@@ -74,6 +75,7 @@ class Clips:
 
     def __init__(self, clips: Sequence[ClipFit]):
         self.clips = tuple(clips)
+        self.store = self.clips[0].store
 
     def __len__(self) -> int:
         return len(self.clips)
@@ -96,6 +98,31 @@ class Clips:
         weights = np.array([clip.expected(beside=False) for clip in self.clips])
         each = np.array([clip.misfit(part) for clip, part in zip(self.clips, fit.parts, strict=True)])
         return float((weights * each).sum() / weights.sum())
+
+    # --- what is kept of fits ---------------------------------------------------------------------------------------
+    def state(self) -> str:
+        """As ``ClipFit.state``, of all clips."""
+        return fingerprint([clip.state() for clip in self.clips])
+
+    def pack(self, fit: JointFit) -> Arrays:
+        """What a store keeps of a fit."""
+        whole = {"whole": np.array([fit.cost, fit.data, fit.evidence]), "joint": fit.z}
+        return {**whole, **{k: v for c, part in enumerate(fit.parts) for k, v in packed(part, f"_{c}").items()}}
+
+    def unpack(self, hypothesis: JointHypothesis, arrays: Arrays) -> JointFit:
+        """The fit again."""
+        cost, data, evidence = arrays["whole"].tolist()
+        parts = tuple(unpacked(part, arrays, f"_{c}") for c, part in enumerate(hypothesis.parts))
+        return JointFit(hypothesis, arrays["joint"], cost, data, parts, evidence)
+
+    def counted(self) -> np.ndarray:
+        """Rollouts of each clip so far."""
+        return np.array([clip.rollouts for clip in self.clips])
+
+    def count(self, more: np.ndarray) -> None:
+        """Counts rollouts that an interrupted run made."""
+        for clip, one in zip(self.clips, more.tolist(), strict=True):
+            clip.rollouts += one
 
     # --- rollouts -------------------------------------------------------------------------------------------------
     def poses(self, hypothesis: JointHypothesis, points: list[np.ndarray]) -> list[np.ndarray]:
@@ -153,6 +180,7 @@ class Clips:
         return result
 
     # --- least squares --------------------------------------------------------------------------------------------
+    @remembered
     def fit(
         self, hypothesis: JointHypothesis, z: np.ndarray, iterations: int = 12, keeps: Keeps = None, scale=SCALE
     ) -> JointFit:
@@ -212,6 +240,7 @@ class Clips:
         part, at = fit.hypothesis.parts[c], fit.hypothesis.split(fit.z if z is None else z)[c]
         return with_frozen_setup(part, at), at[~fit.hypothesis.masks[c]]
 
+    @remembered
     def hop(self, fit: JointFit, seed: int, rounds: int = 3) -> JointFit:
         """Least squares again from better points around its end, as ``ClipFit.hop``.
 

@@ -31,6 +31,7 @@ from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.diagnosis.poses.where import describe, misfit_map, seen_frames
 from mjx_refine.diagnosis.result import ClipGap, Diagnosis, PoseErrors
 from mjx_refine.diagnosis.search import view_of
+from mjx_refine.diagnosis.store import Store
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 from mjx_refine.observation import Observation
@@ -46,6 +47,7 @@ def diagnose_recordings(
     seed: int = 0,
     threads: int | None = None,
     told: Callable[[str], None] | None = None,
+    store: Store | None = None,
 ) -> Diagnosis:
     """Says what a set-up's simulation lacks to replay several recordings of it, and how far that closes the gap.
 
@@ -56,6 +58,7 @@ def diagnose_recordings(
       seed: of everything random, also of which recordings are judged.
       threads: of the simulator; all cores by default.
       told: called with a line for each step.
+      store: where finished fits are kept, so that an interrupted call goes on; nowhere by default.
 
     Raises:
       InputError: scenes differ in kind or have effects, names do not match, nothing moves, or there are too few samples.
@@ -64,6 +67,8 @@ def diagnose_recordings(
     told = told or (lambda line: None)
     set_up = Recordings(matched(scenes, len(poses), "recordings"), poses, threads)
     left_out = (*without, *(name for name, kind in catalogue().items() if not kind.physical))
+    for clip in set_up.clips:
+        clip.store = store or clip.store
     course = run(set_up, scenes[0].names, left_out, seed, told)
     told("report")
     return _result(course, set_up, seed, began)

@@ -19,6 +19,7 @@ from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.diagnosis.poses.where import describe, misfit_map, seen_frames
 from mjx_refine.diagnosis.result import Diagnosis, Gap, PoseErrors
 from mjx_refine.diagnosis.search import Candidate, Compared, compare, view_of
+from mjx_refine.diagnosis.store import Store
 from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, signs
 from mjx_refine.diagnosis.where import places_of
 from mjx_refine.effects import catalogue
@@ -49,6 +50,7 @@ def diagnose_recording(
     seed: int = 0,
     threads: int | None = None,
     told: Callable[[str], None] | None = None,
+    store: Store | None = None,
 ) -> Diagnosis:
     """Says where a scene's simulation and measured poses part, which effect parts them, and how far it closes the gap.
 
@@ -59,6 +61,7 @@ def diagnose_recording(
       seed: of everything random.
       threads: of the simulator; all cores by default.
       told: called with a line for each step.
+      store: where finished fits are kept, so that an interrupted call goes on; nowhere by default.
 
     Raises:
       InputError: the scene has effects, the names do not match, nothing moves, or there are too few samples.
@@ -69,6 +72,7 @@ def diagnose_recording(
     told = told or (lambda line: None)
     scene = started(scene, poses, columns)
     clip = PosesFit(MujocoSimulator(scene.shapes, rate_of(poses.time), threads), poses, columns)
+    clip.store = store or clip.store
     check_motion(clip, poses)
     left_out = (*without, *(name for name, kind in catalogue().items() if not kind.physical))
     blank = Observation(np.zeros((clip.frames - 1, 8, 8, 2), np.float32), None, clip.simulator.fps)

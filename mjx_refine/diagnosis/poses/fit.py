@@ -20,6 +20,7 @@ from mjx_refine.diagnosis.noise import BLUR, Counts, Noise
 from mjx_refine.diagnosis.poses.data import Poses, noise_of, rotation_vector
 from mjx_refine.diagnosis.predict import Prediction
 from mjx_refine.diagnosis.slack import Impact, impacts, kicked, sustained, touching
+from mjx_refine.diagnosis.store import fingerprint
 from mjx_refine.search.landing import slowed
 from mjx_refine.sim.backends import Simulator
 
@@ -156,6 +157,12 @@ class PosesFit(ClipFit):
         chosen = poses.quaternion[[max(j, 0) for j in columns]]
         self.quaternion = np.where(np.isfinite(measured.reach[..., :1]), np.moveaxis(chosen, 0, 1), np.nan)
         self.predictor = PosesPredictor(place, self.quaternion)
+
+    @functools.cached_property
+    def facts(self) -> str:
+        """A fingerprint of the recording."""
+        told = (self.place, self.quaternion, self.measured.moments, self.measured.reach, self.weight)
+        return fingerprint(told, self.frames, self.simulator.fps)
 
     def settle_noise(self, fit: Fit) -> None:
         """Does nothing: the noise is stated, or comes from third differences, which owe nothing to a fit."""

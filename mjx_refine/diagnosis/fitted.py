@@ -1,0 +1,57 @@
+"""Where least squares ended, and the prior that it was fitted with."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.search.landing import slowed
+
+TAIL = 2.0
+"""Prior widths beyond which moving a base parameter costs ever less: half its price is TAIL^2 log(1 + (z / TAIL)^2)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """Where least squares ended.
+
+    Attributes:
+      hypothesis: what was fitted.
+      z: the point.
+      cost: half the sum of squares, with the prior.
+      data: ditto without the prior.
+      jacobian: of the residuals.
+      residual: at the point, in noise widths times the root of their weight.
+      evidence: logarithm of the hypothesis' probability, up to a constant of the clip (Laplace; MacKay 2003, ch. 28).
+    """
+
+    hypothesis: Hypothesis
+    z: Float[np.ndarray, "dimension"]
+    cost: float
+    data: float
+    jacobian: Float[np.ndarray, "residuals dimension"]
+    residual: Float[np.ndarray, "residuals"]
+    evidence: float
+
+    @property
+    def gradient(self) -> Float[np.ndarray, "dimension"]:
+        """Of the cost."""
+        price, slope = prior(self.hypothesis, self.z)
+        return self.jacobian.T @ self.residual + slope * price
+
+    @property
+    def curvature(self) -> Float[np.ndarray, "dimension dimension"]:
+        """Of the cost, by Gauss and Newton."""
+        return self.jacobian.T @ self.jacobian + np.diag(prior(self.hypothesis, self.z)[1] ** 2)
+
+
+def prior(hypothesis: Hypothesis, z: Float[np.ndarray, "*batch dimension"]) -> tuple[np.ndarray, np.ndarray]:
+    """The prior as residuals, and their derivatives in z: heavy-tailed for base parameters, normal for effects'."""
+    heavy = hypothesis.ordinary
+    residual = np.where(heavy, slowed(z, TAIL), z)
+    square = (z / TAIL) ** 2
+    slope = np.where(np.abs(z) > 1e-6, np.abs(z) / np.maximum((1 + square) * np.abs(residual), 1e-12), 1.0)
+    return residual, np.where(heavy, np.maximum(slope, 0.1), 1.0)
