@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import importlib.util
 import os
 from collections.abc import Generator, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from mjx_refine.many.summary import write_summary
 from mjx_refine.many.work import RESULTS, cleared
 from mjx_refine.scene import load_scenes
 from mjx_refine.search import Options
+from mjx_refine.sim.backends import resolve_backend
 
 ENGINES = ("processes", "ray")
 
@@ -65,9 +67,9 @@ def refine_many(
       jobs: what to refine, or the path of a ``jobs.yaml``.
       options: of all jobs; a job's overrides come before them.
       out: folder; a job writes in ``out / job.name`` what a refinement writes, and ``summary.csv`` has a row a job.
-      workers: processes that share the cores; by default one a core with C MuJoCo, one with MJX. A script that calls
-        this needs ``if __name__ == "__main__":``, since each process imports it. With
-        ``ray``: cores of a cluster that is made here.
+      workers: processes that share the cores; by default one a core. With MJX they land and finish clips, while this
+        process searches all clips of a kind together on the device. With ``ray``: cores of a cluster that is made here.
+        A script that calls this needs ``if __name__ == "__main__":``, since each process imports it.
       resume: leave finished jobs alone and go on with unfinished ones from their checkpoints; jobs whose clip, samples
         or options are others than then begin anew.
       engine: ``processes`` of this machine, or ``ray``.
@@ -115,7 +117,22 @@ def _worked(engine: str, ready: list, out: Path, options: Options, workers, addr
         from mjx_refine.many.ray import ray_outcomes
 
         return ray_outcomes(ready, out, options, workers, address, progress)
+    backend = batching_backend(options)
+    if backend is not None and ready:
+        from mjx_refine.many.batched import Batched
+
+        return Batched(ready, out, options, backend, workers, progress).outcomes()
     return Pool(Waiting(ready), out, options, workers, progress).outcomes()
+
+
+def batching_backend(options: Options) -> str | None:
+    """The backend for which clips are searched together; None for C MuJoCo, which has a core for each instead."""
+    if options.backend == "mujoco" or (options.backend == "auto" and importlib.util.find_spec("warp") is None):
+        return None
+    with contextlib.suppress(InputError):  # where it cannot run, every job says why
+        resolved = resolve_backend(options.backend)
+        return None if resolved == "mujoco" else resolved
+    return None
 
 
 def _check_call(jobs: list[Job], workers: int | None, engine: str) -> None:

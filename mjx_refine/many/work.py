@@ -7,17 +7,22 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
+from mjx_refine.compile_cache import enable_cache
 from mjx_refine.errors import InputError
 from mjx_refine.files import remove_stale_parts
 from mjx_refine.many.jobs import Job
 from mjx_refine.many.outcome import BAD_INPUT, DONE, FAILED, SKIPPED, Outcome, outcome_of, result_of
-from mjx_refine.observation import load_observation
+from mjx_refine.observation import Observation, load_observation
 from mjx_refine.report import write_result
-from mjx_refine.scene import load_scenes
+from mjx_refine.scene import Samples, load_scenes
 from mjx_refine.search import Options, Progress, Step, refine
 from mjx_refine.search.checkpoint import input_digest, load_checkpoint
+from mjx_refine.search.problem import Problem
+from mjx_refine.search.ready import Ready
 from mjx_refine.search.refine import CHECKPOINT
+from mjx_refine.search.run import Run
 
 RESULTS = ("refined.yaml", "result.json", "history.csv", "report.html", "overlay.gif")
 
@@ -40,17 +45,60 @@ def work(job: Job, out: Path, common: Options, told: Callable[[float], object] =
     Returns:
       the outcome; nothing is raised but what ends a process.
     """
+    return _caught(job, lambda: _refined(job, out / job.name, job.options(common), told))
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """A job that has landed and waits for its population search elsewhere.
+
+    Attributes:
+      name: of the job.
+      ready: what the search needs; it adds to the checkpoint, from which ``work`` then goes on.
+      digest: of the job, and of its checkpoint.
+    """
+
+    name: str
+    ready: Ready
+    digest: str
+
+
+def prepare(
+    job: Job, out: Path, common: Options, told: Callable[[float], object] = lambda part: None
+) -> Outcome | Prepared:
+    """The first part of a job whose population search happens elsewhere; ``work`` is the last.
+
+    A job that needs no such search, or has its own (scenes with effects), is worked to its end.
+    """
+    return _caught(job, lambda: _prepared(job, out / job.name, job.options(common), told))
+
+
+T = TypeVar("T")
+
+
+def _caught(job: Job, made: Callable[[], T]) -> T | Outcome:
     try:
-        return _refined(job, out / job.name, job.options(common), told)
+        return made()
     except InputError as error:
         return Outcome(job.name, BAD_INPUT, str(error))
     except MemoryError:
         return Outcome(job.name, FAILED, "out of memory; choose fewer --workers or a smaller --resolution")
     except Exception as error:
-        return Outcome(job.name, FAILED, _told_of(error))
+        return Outcome(job.name, FAILED, told_of(error))
 
 
-def _refined(job: Job, folder: Path, options: Options, told: Callable[[float], object]) -> Outcome:
+@dataclasses.dataclass(frozen=True)
+class _Opened:
+    """A job's files, and whether its checkpoint can be gone on from."""
+
+    samples: Samples
+    observation: Observation
+    digest: str
+    resume: bool
+    notes: list[str]
+
+
+def _opened(job: Job, folder: Path, options: Options) -> _Opened | Outcome:
     samples, observation = load_scenes(job.init), load_observation(job.video)
     expected = input_digest(samples, observation, options)
     if finished(folder, expected):
@@ -65,9 +113,50 @@ def _refined(job: Job, folder: Path, options: Options, told: Callable[[float], o
         # Of other options or another clip: what was asked for now is made from the beginning.
         notes.append(f"begun anew: {error}")
         resume = False
-    result = refine(samples, observation, options, progress=_Told(told), folder=folder, resume=resume)
-    write_result(folder, result, observation)
-    return outcome_of(job.name, DONE, folder, "; ".join(notes))
+    return _Opened(samples, observation, expected, resume, notes)
+
+
+_KEPT: dict[str, Problem] = {}
+"""Problems of jobs that were prepared here, for their ends, by digest."""
+
+MOST_KEPT = 8
+
+
+def _refined(job: Job, folder: Path, options: Options, told: Callable[[float], object]) -> Outcome:
+    opened = _opened(job, folder, options)
+    if isinstance(opened, Outcome):
+        return opened
+    return _ended(job, folder, options, opened, told)
+
+
+def _ended(job: Job, folder: Path, options: Options, opened: _Opened, told: Callable[[float], object]) -> Outcome:
+    result = refine(
+        opened.samples,
+        opened.observation,
+        options,
+        progress=_Told(told),
+        folder=folder,
+        resume=opened.resume,
+        problem=_KEPT.pop(opened.digest, None),
+    )
+    write_result(folder, result, opened.observation)
+    return outcome_of(job.name, DONE, folder, "; ".join(opened.notes))
+
+
+def _prepared(job: Job, folder: Path, options: Options, told: Callable[[float], object]) -> Outcome | Prepared:
+    opened = _opened(job, folder, options)
+    if isinstance(opened, Outcome):
+        return opened
+    enable_cache()
+    problem = Problem(opened.samples, opened.observation, options)
+    folder.mkdir(parents=True, exist_ok=True)
+    ready = Run(problem, _Told(told), folder / CHECKPOINT, opened.resume).ready()
+    while len(_KEPT) >= MOST_KEPT:
+        _KEPT.pop(next(iter(_KEPT)))
+    _KEPT[opened.digest] = problem
+    if ready is None:
+        return _ended(job, folder, options, opened, told)
+    return Prepared(job.name, ready, opened.digest)
 
 
 def finished(folder: Path, digest: str) -> bool:
@@ -105,7 +194,7 @@ class _Told(Progress):
             self.told(SEARCHING * min(1.0, step.evaluations / step.budget))
 
 
-def _told_of(error: Exception) -> str:
+def told_of(error: Exception) -> str:
     """An unexpected error in one line, with its place."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from mjx_fitness import Scores
 
+from mjx_refine.batch import SceneBatch
 from mjx_refine.sim.backends import Simulator
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.space import Space
@@ -39,5 +40,9 @@ class Objective:
         batch = self.space.decode(points)
         poses = self.simulator.rollout(batch, self.scorer.length)
         scores = self.scorer(poses, batch)
-        excess = np.maximum(self.reference.overlap(batch) - OVERLAP_ALLOWED, 0.0)
-        return -scores.fitness + OVERLAP_PRICE * excess, scores
+        return -scores.fitness + price_of_overlap(self.reference, batch), scores
+
+
+def price_of_overlap(reference: MujocoSimulator, batch: SceneBatch) -> Float[np.ndarray, "batch"]:
+    """What each candidate pays for objects that overlap in its first frame."""
+    return OVERLAP_PRICE * np.maximum(reference.overlap(batch) - OVERLAP_ALLOWED, 0.0)

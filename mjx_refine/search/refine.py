@@ -45,6 +45,7 @@ def refine(
     progress: Progress | None = None,
     folder: str | Path | None = None,
     resume: bool = False,
+    problem: Problem | None = None,
 ) -> RefineResult:
     """Refines the best of the samples until its simulation replays the clip.
 
@@ -55,6 +56,7 @@ def refine(
       progress: a display; silent by default.
       folder: where to keep a checkpoint; None keeps nothing.
       resume: go on from the checkpoint in ``folder``.
+      problem: of the same samples, observation and options, where it was made before.
 
     Returns:
       the refined scene, its replay, scores before and after, parameters and history. Never worse than the best sample.
@@ -68,7 +70,7 @@ def refine(
     began, compiled = time.monotonic(), _COMPILE["seconds"]
     samples = _as_samples(samples)
     enable_cache()
-    problem = Problem(samples, observation, options)
+    problem = problem or Problem(samples, observation, options)
     checkpoint = None if folder is None else _made(Path(folder)) / CHECKPOINT
     run = Run(problem, progress or Progress(), checkpoint, resume)
     found = run()

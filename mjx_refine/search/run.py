@@ -6,9 +6,7 @@ import dataclasses
 import time
 from pathlib import Path
 
-import mjx_cmaes
 import numpy as np
-from jaxtyping import Float
 from mjx_fitness import Scores
 
 from mjx_refine.effects import batch_with_effects
@@ -16,29 +14,25 @@ from mjx_refine.scene import Scene
 from mjx_refine.search.checkpoint import damaged, input_digest, load_checkpoint, save_checkpoint
 from mjx_refine.search.derivatives import DerivativeChoice, Derivatives
 from mjx_refine.search.intervals import Intervals, intervals
-from mjx_refine.search.landed import LANDED_WELL, PROBING, Landed, first_covariance, fitting_width, landed_well
+from mjx_refine.search.landed import LANDED_WELL, Landed, first_covariance, landed_well
 from mjx_refine.search.landing import LeastSquares
 from mjx_refine.search.objective import Objective
+from mjx_refine.search.population import PopulationSearch
 from mjx_refine.search.problem import Problem, Start, kind_of_scene
 from mjx_refine.search.progress import Progress, Step
+from mjx_refine.search.ready import Ready, Searched
 from mjx_refine.search.schedule import stages
 from mjx_refine.search.undetermined import back_to_start, insensitive
-from mjx_refine.sim.backends import make_simulator
+from mjx_refine.sim.backends import fastest, make_simulator
 from mjx_refine.space import Space
 from mjx_refine.view.effects import needs_pictures
+from mjx_refine.view.grid import sampled
 
 SEARCH_WIDTH = 160
 """Samples across a picture during the search, by default."""
 
 LANDING_SHARE = 0.6
 """Part of the budget that least squares may spend before the population search (``hybrid``)."""
-
-GENERATIONS = 80
-"""Generations for which the budget after a landing must suffice; the population shrinks, down to CMA-ES's default
-4 + 3 ln n (Hansen, The CMA Evolution Strategy: A Tutorial, 2023, table 1), until it does."""
-
-ELITES = 8
-"""Candidates of the search that are compared at full resolution in the end."""
 
 CHECKPOINT_SECONDS = 1.0
 
@@ -97,7 +91,7 @@ class Run:
         self._saved: tuple[dict, dict] | None = None
         self._written = 0.0
         self._planned = 0
-        self._best = (-np.inf, 0.0, 0.0)
+        self._searched: Searched | None = None
         if resume and checkpoint is not None:
             loaded = load_checkpoint(checkpoint, self.digest)
             try:
@@ -123,26 +117,28 @@ class Run:
             self._land()
         start, space, mean, covariance = self._beginning()
         derivatives = self.choice.final(start, space, mean)
-        reason = "Least squares converged."
-        elites = [mean]
-        simulator_name, device = "mujoco", "cpu"
-        searching = time.monotonic()
-        if self.options.optimizer != "gradient":
+        where, elites = Searched("Least squares converged.", "mujoco", "cpu", 0.0), [mean]
+        if self._searched is not None:
+            where = self._searched
+            elites += self._begun(space, mean, covariance).found
+        elif self.options.optimizer != "gradient":
+            began = time.monotonic()
             backend = self.problem.backends[kind_of_scene(start.given)]
+            if backend != "mujoco":
+                backend = fastest(self.options.backend, self.options.population)
             simulator = make_simulator(backend, start.scene.shapes, self.problem.observation.fps)
-            simulator_name, device = simulator.name, simulator.device
-            objective = self._objective(start, space, simulator)
-            reason, found = self._search(objective, mean, covariance)
-            elites += found
+            search = self._search(self._objective(start, space, simulator), mean, covariance)
+            where = Searched(str(search.reason), simulator.name, simulator.device, time.monotonic() - began)
+            elites += search.found
         return Found(
             **self._finish(start, space, elites, self._objective(start, space)),
             derivatives=derivatives,
             history=tuple(self.history),
             evaluations=self.evaluations,
-            reason=reason,
-            backend=simulator_name,
-            device=device,
-            searched=time.monotonic() - searching,
+            reason=where.reason,
+            backend=where.backend,
+            device=where.device,
+            searched=where.seconds,
         )
 
     def _objective(self, start: Start, space: Space, simulator=None) -> Objective:
@@ -222,54 +218,56 @@ class Run:
 
     # Search -------------------------------------------------------------------------------------------------------
 
-    def _search(self, objective: Objective, mean: np.ndarray, covariance: np.ndarray):
-        """Generations until the budget is spent; returns (reason, points for the finish)."""
-        left = self.options.budget - self.evaluations if self._saved is None else 0
-        population = self._population(len(mean), left)
-        settings = mjx_cmaes.Settings(dimension=len(mean), population=population)
-        if self._saved is None:
-            if left < population:
-                return "The budget of rollouts was spent by least squares.", []
-            if landed_well(self.landed) and left > PROBING:
-                width, spent = fitting_width(lambda points: objective(points)[0], mean, covariance, self.options.seed)
-                covariance, self.evaluations = width**2 * covariance, self.evaluations + spent
-            state = mjx_cmaes.init(settings, mean, covariance=covariance, seed=self.options.seed)
-            elites, elite_costs = mean[None], np.full(1, np.inf)
-        else:
-            arrays = self._saved[1]
+    def ready(self) -> Ready | None:
+        """Lands, and says what the population search needs, for a search elsewhere; None where none is left to do.
+
+        The checkpoint is then written, to which a search elsewhere adds (``Ready.checkpoint``), and from which a resumed run
+        goes on to the finish.
+        """
+        if self.options.optimizer == "gradient" or self._searched is not None or self.path is None:
+            return None
+        if self.options.optimizer != "cmaes":
+            self._land()
+        start, space, mean, covariance = self._beginning()
+        batch = batch_with_effects([start.scene])
+        if batch.effects:
+            return None
+        self._save(force=True)
+        return Ready(
+            shapes=start.scene.shapes,
+            fps=self.problem.observation.fps,
+            samples=sampled(self.problem.observation, start.matching, self.resolution),
+            options=self.options,
+            space=space,
+            mean=mean,
+            covariance=covariance,
+            landed=landed_well(self.landed),
+            checkpoint=self.path,
+        )
+
+    def _begun(self, space: Space, mean: np.ndarray, covariance: np.ndarray) -> PopulationSearch:
+        """The search, or what is saved of it."""
+        landed = landed_well(self.landed)
+        search = PopulationSearch(self.options, mean, covariance, space.start, landed, self.evaluations)
+        if self._saved is not None:
             try:
-                state = mjx_cmaes.load_state(settings, {k[4:]: v for k, v in arrays.items() if k.startswith("cma.")})
-                elites, elite_costs = arrays["elites"], arrays["elite_costs"]
+                search.restore(*self._saved)
             except (KeyError, ValueError, TypeError) as error:
                 raise damaged(Path(self.path or ""), error) from error
-        while self.evaluations + population <= self.options.budget:
-            reason = mjx_cmaes.should_stop(settings, state)
-            if reason is not None:
-                return str(reason), [state.mean, *elites]
-            points, state = mjx_cmaes.ask(settings, state)
-            if state.generation == 0:
-                points = mjx_cmaes.inject(points, np.stack([mean, objective.space.start]))
-            costs, scores = objective(points)
-            state, _ = mjx_cmaes.tell(settings, state, points, costs)
-            self.evaluations += len(points)
-            elites, elite_costs, best = _merge(elites, elite_costs, points, costs)
-            if best is not None:
-                self._best = (-float(costs[best]), float(scores.iou[best]), float(scores.epe[best]))
-            self._step("search", self._best, float(state.std.mean()))
-            arrays = {f"cma.{k}": v for k, v in mjx_cmaes.save_state(state).items()}
-            arrays.update(elites=elites, elite_costs=elite_costs)
-            self._saved = ({"best": self._best, "population": population}, arrays)
-            self._save()
-        return "The budget of rollouts is spent.", [np.clip(state.mean, 0, 1), *elites]
+        return search
 
-    def _population(self, dimension: int, left: int) -> int:
-        """Candidates a generation: after a landing, few enough for ``GENERATIONS`` with what is left."""
-        if self._saved is not None:
-            return int(self._saved[0]["population"])
-        if self.options.optimizer == "cmaes":
-            return self.options.population
-        least = min(self.options.population, 4 + int(3 * np.log(dimension)))
-        return int(np.clip(left // GENERATIONS, least, self.options.population))
+    def _search(self, objective: Objective, mean: np.ndarray, covariance: np.ndarray) -> PopulationSearch:
+        """Generations until the search ends."""
+        search = self._begun(objective.space, mean, covariance)
+        while (points := search.points()) is not None:
+            costs, scores = objective(points)
+            generation = search.told(points, costs, scores)
+            self.evaluations = search.evaluations
+            if generation:
+                self._step("search", search.best, search.spread)
+                self._saved = search.saved()
+                self._save()
+        return search
 
     # Finish -------------------------------------------------------------------------------------------------------
 
@@ -340,6 +338,7 @@ class Run:
             "planned": self._planned,
             "landed": [[r.rank, r.fitness, r.iou] for r in self.landed],
             "searching": self._saved is not None,
+            "searched": None if self._searched is None else dataclasses.astuple(self._searched),
         }
         arrays = {}
         for k, r in enumerate(self.landed):
@@ -362,17 +361,7 @@ class Run:
             point, covariance = arrays[f"landed.{k}.point"], arrays[f"landed.{k}.covariance"]
             self.landed.append(Landed(rank, point, covariance, fitness, iou))
         if values["searching"]:
-            self._best = tuple(values["best"])
             self._saved = (values, arrays)
+        if values.get("searched") is not None:
+            self._searched = Searched(*values["searched"])
         self.progress.message(f"resumed after {self.evaluations} rollouts")
-
-
-def _merge(
-    elites: Float[np.ndarray, "elites dimension"], elite_costs: np.ndarray, points: np.ndarray, costs: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, int | None]:
-    """The best of old elites and new points, and the row of a new overall best (None where there is none)."""
-    best = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
-    improved = costs[best] < elite_costs.min()
-    together, prices = np.concatenate([elites, points]), np.concatenate([elite_costs, costs])
-    order = np.argsort(np.where(np.isfinite(prices), prices, np.inf), kind="stable")[:ELITES]
-    return together[order], prices[order], best if improved else None

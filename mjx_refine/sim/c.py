@@ -7,7 +7,7 @@ import os
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from mujoco import rollout
 
 from mjx_refine.batch import SceneBatch
@@ -128,10 +128,13 @@ class MujocoSimulator:
         depth = np.zeros(len(batch))
         if len(self.shapes) < 2:
             return depth
-        models = self._prepare(batch)
+        near = np.nonzero(_spheres_meet(batch))[0]
+        if not len(near):
+            return depth
+        models = self._prepare(batch[near])
         qpos, _ = initial_state(batch)
         data = self._data[0]
-        for row, model in enumerate(models):
+        for row, model in zip(near, models, strict=True):
             data.qpos[:] = qpos[row]
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
@@ -141,3 +144,11 @@ class MujocoSimulator:
                 between = contact.geom.min(axis=1) > 0
                 depth[row] = np.max(-contact.dist[between], initial=0.0)
         return depth
+
+
+def _spheres_meet(batch: SceneBatch) -> Bool[np.ndarray, "batch"]:
+    """Whether any two objects' bounding spheres meet in the first frame: else nothing touches."""
+    radius = model_fields(batch).geom_rbound
+    apart = np.linalg.norm(batch.position[:, :, None] - batch.position[:, None], axis=-1)
+    meet = apart < 1.001 * (radius[:, :, None] + radius[:, None])
+    return (meet & ~np.eye(radius.shape[1], dtype=bool)).any((1, 2))

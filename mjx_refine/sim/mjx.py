@@ -20,7 +20,7 @@ from mjx_refine.sim.leaves import Leaves, candidate_model, leaves_of
 from mjx_refine.sim.mjx_import import mjx
 from mjx_refine.sim.model import SUBSTEPS, build_spec, initial_state
 
-BUCKETS = (1, 4, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192)
+BUCKETS = (1, 4, 16, 32, 64, 128, 256, 512, 1024, 1536, 2048, 3072, 4096, 6144, 8192)
 """Batch sizes that programs are compiled for; a batch is padded to the next."""
 
 
@@ -145,9 +145,15 @@ class MjxSimulator:
         simulator = self if acting.centre_of_mass(batch) is None else self._beside()
         return carried(batch, frames, lambda inside, needed, _: simulator._rollout(inside, needed))
 
-    def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
+    def launch(self, batch: SceneBatch, frames: int) -> Float[Array, "rows frames objects 7"]:
+        """Poses on the device, which computes on when this returns; rows beyond the batch's repeat its last candidate.
+
+        For scenes without effects. What has diverged is not marked.
+        """
         full = padded(batch, len(self.devices))
         qpos, qvel = initial_state(full)
         arguments = self.devices.dealt((leaves_of(full), jnp.asarray(qpos), jnp.asarray(qvel)))
-        poses = self._program(arguments, frames)(*arguments)
-        return diverged_to_nan(np.asarray(poses, np.float64)[: len(batch)])
+        return self._program(arguments, frames)(*arguments)
+
+    def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
+        return diverged_to_nan(np.asarray(self.launch(batch, frames), np.float64)[: len(batch)])

@@ -140,9 +140,15 @@ class WarpSimulator:
         simulator = self if acting.centre_of_mass(batch) is None else self._beside()
         return carried(batch, frames, lambda inside, needed, _: simulator._rollout(inside, needed))
 
-    def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
+    def launch(self, batch: SceneBatch, frames: int) -> Float[Array, "rows frames objects 7"]:
+        """Poses on the device, which computes on when this returns; rows beyond the batch's repeat its last candidate.
+
+        For scenes without effects. What has diverged is not marked.
+        """
         full = padded(batch)
         qpos, qvel = initial_state(full)
         arguments = (leaves_of(full), jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
-        poses = self._program(arguments, frames)(*arguments)
-        return diverged_to_nan(np.asarray(poses, np.float64)[: len(batch)])
+        return self._program(arguments, frames)(*arguments)
+
+    def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
+        return diverged_to_nan(np.asarray(self.launch(batch, frames), np.float64)[: len(batch)])

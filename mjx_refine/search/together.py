@@ -1,0 +1,239 @@
+"""Population searches of many clips of one kind in lock-step: one rollout and one comparison of pictures a generation for all."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import time
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from mjx_fitness import Scores
+
+from mjx_refine.batch import SceneBatch, concatenate
+from mjx_refine.errors import InputError
+from mjx_refine.search.checkpoint import damaged, load_checkpoint, save_checkpoint
+from mjx_refine.search.objective import price_of_overlap
+from mjx_refine.search.population import PopulationSearch
+from mjx_refine.search.progress import Step
+from mjx_refine.search.ready import Ready, Searched
+from mjx_refine.sim.backends import Simulator
+from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.view.grid import GridScorer
+
+log = logging.getLogger("mjx_refine")
+
+CANDIDATES = 8192
+"""Most in one batch: what is more goes one batch after the other. Halved for good where a device's memory does not suffice."""
+
+LEAST = 64
+"""A batch that does not fit in memory and is no larger than this fails."""
+
+CHECKPOINT_SECONDS = 10.0
+"""Between two checkpoints of a clip; what is lost is computed again."""
+
+
+class Member:
+    """One clip's search and its checkpoint.
+
+    Args:
+      ready: what a run left.
+      digest: of the run, which its checkpoint must have.
+
+    Raises:
+      InputError: the checkpoint is damaged, or of another run.
+    """
+
+    def __init__(self, ready: Ready, digest: str):
+        self.ready = ready
+        loaded = load_checkpoint(ready.checkpoint, digest)
+        if loaded is None:
+            raise InputError(f"{ready.checkpoint}: it is gone; expected the checkpoint that was just written")
+        self.values, self.arrays = loaded
+        self.began, self.written = time.monotonic(), time.monotonic()
+        self.before = float(self.values["seconds"])
+        space = ready.space
+        evaluations = int(self.values["evaluations"])
+        self.search = PopulationSearch(
+            ready.options, ready.mean, ready.covariance, space.start, ready.landed, evaluations
+        )
+        if self.values["searching"]:
+            try:
+                self.search.restore(self.values, self.arrays)
+            except (KeyError, ValueError, TypeError) as error:
+                raise damaged(ready.checkpoint, error) from error
+
+    def told(self, points: np.ndarray, costs: np.ndarray, scores: Scores) -> None:
+        """Takes a generation's costs; saves the search now and then."""
+        if self.search.told(points, costs, scores):
+            fitness, iou, epe = self.search.best
+            step = Step(
+                phase="search",
+                iteration=sum(row[0] == "search" for row in self.values["history"]),
+                evaluations=self.search.evaluations,
+                budget=self.ready.options.budget,
+                seconds=self._seconds,
+                fitness=fitness,
+                iou=iou,
+                epe=epe,
+                spread=self.search.spread,
+            )
+            self.values["history"].append(list(dataclasses.astuple(step)))
+        if time.monotonic() - self.written > CHECKPOINT_SECONDS:
+            self.save()
+
+    def save(self, searched: Searched | None = None) -> None:
+        """Writes the checkpoint; with ``searched`` a resumed run goes on to the finish."""
+        saved = self.search.saved()
+        if saved is not None:
+            self.values.update(saved[0], searching=True)
+            self.arrays.update(saved[1])
+        self.values.update(evaluations=self.search.evaluations, seconds=self._seconds)
+        if searched is not None:
+            self.values["searched"] = dataclasses.astuple(searched)
+        values = {key: value for key, value in self.values.items() if key != "version"}
+        save_checkpoint(self.ready.checkpoint, values, self.arrays)
+        self.written = time.monotonic()
+
+    @property
+    def _seconds(self) -> float:
+        return self.before + time.monotonic() - self.began
+
+
+Asked: TypeAlias = tuple[Member, np.ndarray, SceneBatch]
+"""A member, the points that it asks for, and their candidates."""
+
+Ended = Callable[[Member, Exception | None], object]
+"""Is told each member whose search has ended; with an error, that it has failed."""
+
+
+class Together:
+    """Searches of clips of one kind, a generation of all of them at a time.
+
+    Args:
+      members: of one ``Ready.kind``.
+      simulator: of the kind; with ``launch`` the poses stay on its device.
+      ended: is told.
+      going: is told the number of evaluations of every member, after each generation.
+    """
+
+    def __init__(
+        self,
+        members: Sequence[Member],
+        simulator: Simulator,
+        ended: Ended,
+        going: Callable[[Sequence[Member]], object] = lambda members: None,
+    ):
+        self.members, self.simulator, self.ended, self.going = list(members), simulator, ended, going
+        first = members[0].ready
+        self.reference = MujocoSimulator(first.shapes, first.fps, 1)
+        self.most = CANDIDATES
+        self.began = time.monotonic()
+        self._scorers: dict[tuple[int, ...], GridScorer] = {}
+
+    def run(self) -> None:
+        """Runs all searches to their ends."""
+        while self.members:
+            parts = _parts(self._asked(), self.most)
+            current = {_key(part): self._scorers.get(_key(part)) for part in parts}
+            self._scorers = {key: scorer for key, scorer in current.items() if scorer is not None}
+            for part in parts:
+                self._generation(part)
+            self.going(self.members)
+
+    def _asked(self) -> list[Asked]:
+        """(member, its points, their candidates) of all that go on; the others leave."""
+        asked, staying = [], []
+        for member in self.members:
+            try:
+                points = member.search.points()
+                if points is None:
+                    self._leaves(member)
+                    continue
+                asked.append((member, points, member.ready.space.decode(points)))
+                staying.append(member)
+            except Exception as error:  # one clip's failure is its own
+                self.ended(member, error)
+        self.members = staying
+        return asked
+
+    def _leaves(self, member: Member) -> None:
+        seconds = time.monotonic() - self.began
+        member.save(Searched(str(member.search.reason), self.simulator.name, self.simulator.device, seconds))
+        self.ended(member, None)
+
+    def _generation(self, part: list[Asked]) -> None:
+        try:
+            told = self._evaluated(part)
+        except Exception as error:
+            total = sum(len(points) for _, points, _ in part)
+            if _memory_is_short(error) and total > LEAST and len(part) > 1:
+                self.most = max(LEAST, total // 2)
+                log.warning("%d candidates do not fit in the device's memory; now at most %d at once", total, self.most)
+                for less in _parts(part, self.most):
+                    self._generation(less)
+                return
+            for member, _, _ in part:
+                self._failed(member, error)
+            return
+        for (member, points, _), (costs, scores) in zip(part, told, strict=True):
+            try:
+                member.told(points, costs, scores)
+            except Exception as error:
+                self._failed(member, error)
+
+    def _failed(self, member: Member, error: Exception) -> None:
+        self.members = [other for other in self.members if other is not member]
+        self.ended(member, error)
+
+    def _evaluated(self, part: list[Asked]) -> list[tuple[np.ndarray, Scores]]:
+        """(costs, scores) of each member's points."""
+        batch = concatenate([candidates for _, _, candidates in part])
+        scorer = self._scorer(part)
+        poses = self._poses(batch, scorer.length)
+        prices = price_of_overlap(self.reference, batch)  # while the device computes
+        counts = [len(points) for _, points, _ in part]
+        scores = scorer.score(poses, batch, counts)
+        ends = np.cumsum(counts)[:-1]
+        return [(price - one.fitness, one) for price, one in zip(np.split(prices, ends), scores, strict=True)]
+
+    def _poses(self, batch: SceneBatch, frames: int) -> Float[Array, "rows frames objects 7"]:
+        launch = getattr(self.simulator, "launch", None)
+        if launch is not None:
+            return launch(batch, frames)
+        return jnp.asarray(self.simulator.rollout(batch, frames), jnp.float32)
+
+    def _scorer(self, part: list[Asked]) -> GridScorer:
+        """The members' clips on the device: put there when they are first searched together, and when one has left."""
+        key = _key(part)
+        if key not in self._scorers:
+            ready = [member.ready for member, _, _ in part]
+            clips, weights = [one.samples for one in ready], [one.options.weights for one in ready]
+            self._scorers[key] = GridScorer(ready[0].shapes, clips, weights)
+        return self._scorers[key]
+
+
+def _key(part: list[Asked]) -> tuple[int, ...]:
+    return tuple(id(member) for member, _, _ in part)
+
+
+def _parts(asked: list[Asked], most: int) -> list[list[Asked]]:
+    """Members whose candidates fit in one batch, in order; a member alone may have more."""
+    parts: list[list[Asked]] = []
+    room = 0
+    for entry in asked:
+        count = len(entry[1])
+        if not parts or count > room:
+            parts.append([])
+            room = most
+        parts[-1].append(entry)
+        room -= count
+    return parts
+
+
+def _memory_is_short(error: Exception) -> bool:
+    return isinstance(error, MemoryError | jax.errors.JaxRuntimeError) and "memory" in str(error).lower()

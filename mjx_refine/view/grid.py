@@ -1,0 +1,279 @@
+"""Scores of many candidates of many clips at once: every sample is drawn, compared and summed in one kernel.
+
+On a GPU this beats tiles: nothing is decided on the host between poses and sums, and a device with bandwidth to spare draws
+background faster than it could be told where there is none. Clips of one scene kind and size are scored together.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from mjx_fitness import UNMATCHED, Scores, Sums, Weights, scores_from_sums
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.observation import Observation
+from mjx_refine.scene import Shape
+from mjx_refine.view.frames import Frames, make_frames
+from mjx_refine.view.rays import cast
+from mjx_refine.view.tiles import foreground
+
+CHUNK = 16
+"""Candidates of one clip in one kernel; a clip's candidates are padded to a multiple."""
+
+AWAY = (0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0)
+"""The pose of what is not to be seen."""
+
+FARTHEST = 1e4
+"""Coordinate beyond which a candidate has diverged [m]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SampledClip:
+    """One clip at the samples, C order; P samples a frame.
+
+    Attributes:
+      image: (width, height) of the full picture [px].
+      resolution: (width, height) of the samples.
+      x, y: image coordinates of the samples [px].
+      ids: 0 the background, n + 1 what is matched to object n, the next one for what is matched to none.
+      flow_x, flow_y: [px/frame]; NaN where not measured, and in the last frame.
+      moving_only: whether only what moves counts as seen, for clips without masks.
+    """
+
+    image: tuple[int, int]
+    resolution: tuple[int, int]
+    x: Float[np.ndarray, "samples"]
+    y: Float[np.ndarray, "samples"]
+    ids: Int[np.ndarray, "frames samples"]
+    flow_x: Float[np.ndarray, "frames samples"]
+    flow_y: Float[np.ndarray, "frames samples"]
+    moving_only: bool
+
+    @property
+    def kind(self) -> tuple:
+        """Clips of one kind can be scored together."""
+        return self.image, self.resolution, len(self.ids), self.moving_only
+
+
+def sampled(
+    observation: Observation, matching: Sequence[int], resolution: tuple[int, int] | None = None
+) -> SampledClip:
+    """A clip at ``resolution`` (width, height) samples, each a pixel of the full picture; by default all of them.
+
+    ``matching`` gives for each object its mask's id, or ``UNMATCHED``.
+    """
+    wanted = resolution or observation.size
+    columns, rows = (
+        np.floor((np.arange(min(some, full)) + 0.5) * full / min(some, full)).astype(np.int64)
+        for some, full in zip(wanted, observation.size, strict=True)
+    )
+    masks = foreground(observation)[:, rows][:, :, columns]
+    ids = np.full(masks.shape, len(matching) + 1, np.int8) * (masks > 0)
+    for n, i in enumerate(matching):
+        if i != UNMATCHED:
+            ids[masks == i] = n + 1
+    if observation.masks is None:
+        ids[-1] = 0
+    flow = np.full((2, *ids.shape), np.nan, np.float32)
+    flow[:, :-1] = np.moveaxis(observation.flow[:, rows][:, :, columns], -1, 0)
+    length = len(ids)
+    x, y = np.meshgrid(columns + 0.5, rows + 0.5)
+    return SampledClip(
+        image=observation.size,
+        resolution=(len(columns), len(rows)),
+        x=x.ravel().astype(np.float32),
+        y=y.ravel().astype(np.float32),
+        ids=ids.astype(np.int8).reshape(length, -1),
+        flow_x=flow[0].reshape(length, -1),
+        flow_y=flow[1].reshape(length, -1),
+        moving_only=observation.masks is None,
+    )
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class _Clips:
+    """C clips on the device."""
+
+    x: Float[Array, "samples"]
+    y: Float[Array, "samples"]
+    ids: Int[Array, "clips frames samples"]
+    flow_x: Float[Array, "clips frames samples"]
+    flow_y: Float[Array, "clips frames samples"]
+
+
+class GridScorer:
+    """Scores candidates of one scene kind, each against the clip that it belongs to.
+
+    Args:
+      shapes: the scene kind.
+      clips: of one kind.
+      weights: of each clip's fitness.
+
+    Raises:
+      ValueError: no clip, or clips that cannot be scored together.
+    """
+
+    def __init__(
+        self, shapes: tuple[Shape, ...], clips: Sequence[SampledClip], weights: Sequence[Weights] | None = None
+    ):
+        if not clips or any(clip.kind != clips[0].kind for clip in clips):
+            raise ValueError(f"clips {[clip.kind for clip in clips]}; expected at least one, all of one kind")
+        self.shapes, first = shapes, clips[0]
+        self.weights = tuple(weights or [Weights()] * len(clips))
+        self.image, self.length, self.moving_only = first.image, len(first.ids), first.moving_only
+        room = 1 << (len(clips) - 1).bit_length()  # few sizes are ever compiled
+        kept = [*clips, *[first] * (room - len(clips))]
+        self._clips = _Clips(
+            x=jnp.asarray(first.x),
+            y=jnp.asarray(first.y),
+            **{name: jnp.asarray(np.stack([getattr(c, name) for c in kept])) for name in ("ids", "flow_x", "flow_y")},
+        )
+        self._observed = [_observed(clip, len(shapes)) for clip in clips]
+
+    def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Scores:
+        """Scores against the first clip; a candidate whose poses are not finite has fitness -inf and IoU 0."""
+        return self.score(jnp.asarray(poses, jnp.float32), batch, [len(batch)])[0]
+
+    def score(
+        self, poses: Float[Array, "rows frames objects 7"], batch: SceneBatch, counts: Sequence[int]
+    ) -> list[Scores]:
+        """Scores of every clip's candidates.
+
+        Args:
+          poses: of the candidates of all clips, one clip after the other; there may be further rows.
+          batch: the candidates, without further rows.
+          counts: how many each clip has; one a clip.
+        """
+        rows, clip, places = _layout(counts, len(batch))
+        arrays = (batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
+        kept = tuple(jnp.asarray(np.asarray(a, np.float32)[rows]) for a in arrays)
+        totals, bad = _scored(
+            self.shapes, self.image, self.moving_only, poses, jnp.asarray(rows), *kept, jnp.asarray(clip), self._clips
+        )
+        totals, bad = np.asarray(totals, np.float64), np.asarray(bad)
+        result = []
+        for k, place in enumerate(places):
+            sums = _sums(totals[:, place], self._observed[k], len(self.shapes))
+            scores = scores_from_sums(sums, self.weights[k])
+            lost = bad[place]
+            fitness, iou = np.where(lost, -np.inf, scores.fitness), np.where(lost, 0.0, scores.iou)
+            result.append(dataclasses.replace(scores, fitness=fitness, iou=iou))
+        return result
+
+
+def _layout(counts: Sequence[int], total: int) -> tuple[np.ndarray, np.ndarray, list[slice]]:
+    """(row of each place, clip of each chunk, places of each clip): every clip padded to whole chunks, the chunks to few
+    numbers of them."""
+    if sum(counts) != total:
+        raise ValueError(f"counts add up to {sum(counts)}; expected the batch's {total}")
+    rows, clip, places, first = [], [], [], 0
+    for k, count in enumerate(counts):
+        chunks = -(-count // CHUNK)
+        places.append(slice(len(clip) * CHUNK, len(clip) * CHUNK + count))
+        rows.append(first + np.minimum(np.arange(chunks * CHUNK), max(count - 1, 0)))
+        clip += [k] * chunks
+        first += count
+    spare = _chunk_bucket(len(clip)) - len(clip)
+    rows.append(np.zeros(spare * CHUNK, np.int64))
+    return np.concatenate(rows).astype(np.int32), np.array(clip + [0] * spare, np.int32), places
+
+
+def _chunk_bucket(count: int) -> int:
+    """The next of few numbers of chunks: at most an eighth of them is spare."""
+    step = max(1, 1 << max(count.bit_length() - 4, 0))
+    return -(-count // step) * step
+
+
+def _observed(clip: SampledClip, objects: int) -> dict[str, np.ndarray]:
+    valid = np.isfinite(clip.flow_x) & np.isfinite(clip.flow_y)
+    seen = clip.ids > 0
+    return {
+        "foreground": seen.sum(1).astype(np.float64),
+        "objects": np.stack([(clip.ids == n + 1).sum(1) for n in range(objects)], -1).astype(np.float64),
+        "measured": valid.sum(1)[:-1].astype(np.float64),
+        "object_measured": (valid & seen).sum(1)[:-1].astype(np.float64),
+    }
+
+
+def _sums(totals: Float[np.ndarray, "sums batch frames"], seen: dict[str, np.ndarray], objects: int) -> Sums:
+    intersection, predicted, error, object_error = totals[:4]
+    both, drawn = np.moveaxis(totals[4 : 4 + objects], 0, -1), np.moveaxis(totals[4 + objects :], 0, -1)
+    count = totals.shape[1]
+
+    def repeated(name: str) -> np.ndarray:
+        return np.broadcast_to(seen[name], (count, *seen[name].shape))
+
+    return Sums(
+        intersection=intersection,
+        union=repeated("foreground") + predicted - intersection,
+        object_intersection=both,
+        object_union=repeated("objects") + drawn - both,
+        error=error[:, :-1],
+        measured=repeated("measured"),
+        object_error=object_error[:, :-1],
+        object_measured=repeated("object_measured"),
+    )
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _scored(
+    shapes: tuple[Shape, ...],
+    image: tuple[int, int],
+    moving_only: bool,
+    poses: Float[Array, "rows frames objects 7"],
+    row: Int[Array, "places"],
+    size: Float[Array, "places objects 3"],
+    position: Float[Array, "places 3"],
+    pitch: Float[Array, "places"],
+    fovy: Float[Array, "places"],
+    clip: Int[Array, "chunks"],
+    clips: _Clips,
+) -> tuple[Float[Array, "sums places frames"], Bool[Array, "places"]]:
+    """(sums, whether a candidate diverged)."""
+    poses = poses[row]
+    places, length = poses.shape[:2]
+    bad = ~jnp.isfinite(poses).all((1, 2, 3)) | (jnp.abs(poses[..., :3]) > FARTHEST).any((1, 2, 3))
+    poses = jnp.where(bad[:, None, None, None], jnp.array(AWAY, jnp.float32), poses)
+    frames = make_frames(poses, size, position, pitch, fovy, image[1])
+    chunked = jax.tree.map(lambda a: a.reshape(len(clip), CHUNK * length, *a.shape[1:]), frames)
+
+    def one(part: tuple[Frames, Array]) -> Array:
+        return _chunk_sums(shapes, image, moving_only, part[0], clips, part[1], length)
+
+    totals = jax.lax.map(one, (chunked, clip))  # (chunks, sums, CHUNK * frames)
+    return jnp.moveaxis(totals, 1, 0).reshape(-1, places, length), bad
+
+
+def _chunk_sums(shapes, image, moving_only, frames: Frames, clips: _Clips, clip: Array, length: int) -> Array:
+    """(sums, frames of CHUNK candidates): intersection, predicted, error, the same on objects, each object's two."""
+    samples = clips.x.shape[0]
+
+    def seen_in(frame_major: Array) -> Array:
+        one = jax.lax.dynamic_index_in_dim(frame_major, clip, keepdims=False)
+        return jnp.broadcast_to(one, (CHUNK, length, samples)).reshape(CHUNK * length, samples)
+
+    seen, seen_x, seen_y = seen_in(clips.ids), seen_in(clips.flow_x), seen_in(clips.flow_y)
+    x, y = (jnp.broadcast_to(a, seen.shape) for a in (clips.x, clips.y))
+    ids, flow_x, flow_y = cast(shapes, frames, x, y, (image[0] / 2, image[1] / 2))
+    if moving_only:
+        ids = jnp.where(flow_x * flow_x + flow_y * flow_y > 0.25, ids, 0)
+    error = jnp.sqrt((flow_x - seen_x) ** 2 + (flow_y - seen_y) ** 2)
+    error = jnp.where(jnp.isfinite(seen_x) & jnp.isfinite(seen_y), error, 0.0)
+    columns = [
+        jnp.where((ids > 0) & (seen > 0), 1.0, 0.0),
+        jnp.where(ids > 0, 1.0, 0.0),
+        error,
+        jnp.where(seen > 0, error, 0.0),
+        *[jnp.where((ids == n + 1) & (seen == n + 1), 1.0, 0.0) for n in range(len(shapes))],
+        *[jnp.where(ids == n + 1, 1.0, 0.0) for n in range(len(shapes))],
+    ]
+    zero = [jnp.float32(0.0)] * len(columns)
+    # One reduction with many operands: one pass over the samples, nothing of their size is written to memory.
+    return jnp.stack(jax.lax.reduce(columns, zero, lambda a, b: [i + j for i, j in zip(a, b, strict=True)], [1]))
