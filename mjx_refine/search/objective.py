@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from mjx_fitness import Scores
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.sim.backends import Simulator
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.space import Space
+from mjx_refine.view.grid import GridScorer
 from mjx_refine.view.picture_scorer import PictureScorer
 from mjx_refine.view.tiles import TileScorer
 
@@ -31,16 +32,32 @@ class Objective:
     """
 
     def __init__(
-        self, space: Space, simulator: Simulator, reference: MujocoSimulator, scorer: TileScorer | PictureScorer
+        self,
+        space: Space,
+        simulator: Simulator,
+        reference: MujocoSimulator,
+        scorer: TileScorer | PictureScorer | GridScorer,
     ):
         self.space, self.simulator, self.reference, self.scorer = space, simulator, reference, scorer
 
     def __call__(self, points: Float[np.ndarray, "batch dimension"]) -> tuple[Float[np.ndarray, "batch"], Scores]:
         """(costs, scores); the cost of a candidate that diverges is inf."""
         batch = self.space.decode(points)
-        poses = self.simulator.rollout(batch, self.scorer.length)
-        scores = self.scorer(poses, batch)
-        return -scores.fitness + price_of_overlap(self.reference, batch), scores
+        if isinstance(self.scorer, GridScorer):
+            poses = launched(self.simulator, batch, self.scorer.length)
+            price = price_of_overlap(self.reference, batch)  # while the device computes
+            scores = self.scorer.score(poses, batch, [len(batch)])[0]
+            return price - scores.fitness, scores
+        scores = self.scorer(self.simulator.rollout(batch, self.scorer.length), batch)
+        return price_of_overlap(self.reference, batch) - scores.fitness, scores
+
+
+def launched(
+    simulator: Simulator, batch: SceneBatch, frames: int
+) -> Float[Array | np.ndarray, "rows frames objects 7"]:
+    """Poses where ``GridScorer.score`` takes them: on the simulator's device, where it has one."""
+    launch = getattr(simulator, "launch", None)
+    return simulator.rollout(batch, frames) if launch is None or batch.effects else launch(batch, frames)
 
 
 def price_of_overlap(reference: MujocoSimulator, batch: SceneBatch) -> Float[np.ndarray, "batch"]:

@@ -20,6 +20,7 @@ from mjx_refine.search.problem import Problem
 from mjx_refine.search.progress import Progress
 from mjx_refine.search.result import ParameterRow, RefineResult, Replay
 from mjx_refine.search.run import Found, Run
+from mjx_refine.sim.devices import on_host
 from mjx_refine.space import Space
 from mjx_refine.view.effects import draw_effects, needs_pictures
 
@@ -70,13 +71,14 @@ def refine(
     began, compiled = time.monotonic(), _COMPILE["seconds"]
     samples = _as_samples(samples)
     enable_cache()
-    problem = problem or Problem(samples, observation, options)
-    checkpoint = None if folder is None else _made(Path(folder)) / CHECKPOINT
-    run = Run(problem, progress or Progress(), checkpoint, resume)
-    found = run()
-    first = problem.starts[0]
-    refined = replay(found.scene, observation, problem, found.start.matching)
-    init = replay(first.given, observation, problem, first.matching)
+    with on_host():
+        problem = problem or Problem(samples, observation, options)
+        checkpoint = None if folder is None else _made(Path(folder)) / CHECKPOINT
+        run = Run(problem, progress or Progress(), checkpoint, resume)
+        found = run()
+        first = problem.starts[0]
+        refined = replay(found.scene, observation, problem, found.start.matching)
+        init = replay(first.given, observation, problem, first.matching)
     total = run.before + time.monotonic() - began
     return RefineResult(
         options=options,

@@ -24,9 +24,10 @@ from mjx_refine.search.ready import Ready, Searched
 from mjx_refine.search.schedule import stages
 from mjx_refine.search.undetermined import back_to_start, insensitive
 from mjx_refine.sim.backends import fastest, make_simulator
+from mjx_refine.sim.devices import has_accelerator, on_device
 from mjx_refine.space import Space
 from mjx_refine.view.effects import needs_pictures
-from mjx_refine.view.grid import sampled
+from mjx_refine.view.grid import GridScorer, sampled
 
 SEARCH_WIDTH = 160
 """Samples across a picture during the search, by default."""
@@ -126,8 +127,9 @@ class Run:
             backend = self.problem.backends[kind_of_scene(start.given)]
             if backend != "mujoco":
                 backend = fastest(self.options.backend, self.options.population)
-            simulator = make_simulator(backend, start.scene.shapes, self.problem.observation.fps)
-            search = self._search(self._objective(start, space, simulator), mean, covariance)
+            with on_device():
+                simulator = make_simulator(backend, start.scene.shapes, self.problem.observation.fps)
+                search = self._search(self._objective(start, space, simulator), mean, covariance)
             where = Searched(str(search.reason), simulator.name, simulator.device, time.monotonic() - began)
             elites += search.found
         return Found(
@@ -144,6 +146,10 @@ class Run:
     def _objective(self, start: Start, space: Space, simulator=None) -> Objective:
         reference = self.problem.reference(start.scene.shapes)
         pictures = needs_pictures(batch_with_effects([start.scene]))
+        if simulator is not None and not pictures and has_accelerator():
+            clip = sampled(self.problem.observation, start.matching, self.resolution)
+            grid = GridScorer(start.scene.shapes, [clip], [self.options.weights])
+            return Objective(space, simulator, reference, grid)
         scorer = self.problem.scorer(start.scene.shapes, start.matching, self.resolution, pictures)
         return Objective(space, simulator or reference, reference, scorer)
 

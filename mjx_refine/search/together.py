@@ -9,15 +9,13 @@ from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from mjx_fitness import Scores
 
 from mjx_refine.batch import SceneBatch, concatenate
 from mjx_refine.errors import InputError
 from mjx_refine.search.checkpoint import damaged, load_checkpoint, save_checkpoint
-from mjx_refine.search.objective import price_of_overlap
+from mjx_refine.search.objective import launched, price_of_overlap
 from mjx_refine.search.population import PopulationSearch
 from mjx_refine.search.progress import Step
 from mjx_refine.search.ready import Ready, Searched
@@ -194,18 +192,12 @@ class Together:
         """(costs, scores) of each member's points."""
         batch = concatenate([candidates for _, _, candidates in part])
         scorer = self._scorer(part)
-        poses = self._poses(batch, scorer.length)
+        poses = launched(self.simulator, batch, scorer.length)
         prices = price_of_overlap(self.reference, batch)  # while the device computes
         counts = [len(points) for _, points, _ in part]
         scores = scorer.score(poses, batch, counts)
         ends = np.cumsum(counts)[:-1]
         return [(price - one.fitness, one) for price, one in zip(np.split(prices, ends), scores, strict=True)]
-
-    def _poses(self, batch: SceneBatch, frames: int) -> Float[Array, "rows frames objects 7"]:
-        launch = getattr(self.simulator, "launch", None)
-        if launch is not None:
-            return launch(batch, frames)
-        return jnp.asarray(self.simulator.rollout(batch, frames), jnp.float32)
 
     def _scorer(self, part: list[Asked]) -> GridScorer:
         """The members' clips on the device: put there when they are first searched together, and when one has left."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -10,6 +11,30 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 AXIS = "candidates"
+
+
+@contextlib.contextmanager
+def on_host() -> Iterator[None]:
+    """JAX's work done by the CPU: small programs whose numbers are wanted at once cost a GPU more than they cost a core."""
+    try:
+        host = jax.local_devices(backend="cpu")[0]
+    except RuntimeError:  # JAX was told to have nothing but the GPU
+        yield
+        return
+    with jax.default_device(host):
+        yield
+
+
+@contextlib.contextmanager
+def on_device() -> Iterator[None]:
+    """Inside ``on_host``: JAX's work done by its usual device again."""
+    with jax.default_device(None):
+        yield
+
+
+def has_accelerator() -> bool:
+    """Whether JAX's usual device is no CPU."""
+    return jax.default_backend() != "cpu"
 
 
 class Devices:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 from mjx_fitness import UNMATCHED, Scores, Sums, Weights, scores_from_sums
 
 from mjx_refine.batch import SceneBatch
@@ -23,8 +23,11 @@ from mjx_refine.view.frames import Frames, make_frames
 from mjx_refine.view.rays import cast
 from mjx_refine.view.tiles import foreground
 
-CHUNK = 16
+CHUNKS = (128, 64, 32, 16)
 """Candidates of one clip in one kernel; a clip's candidates are padded to a multiple."""
+
+SPARE = 1.1
+"""Padding may cost this factor; smaller chunks are taken where it costs more."""
 
 AWAY = (0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0)
 """The pose of what is not to be seen."""
@@ -135,14 +138,15 @@ class GridScorer:
             y=jnp.asarray(first.y),
             **{name: jnp.asarray(np.stack([getattr(c, name) for c in kept])) for name in ("ids", "flow_x", "flow_y")},
         )
+        self._layouts: dict[tuple[int, ...], _Layout] = {}
         self._observed = [_observed(clip, len(shapes)) for clip in clips]
 
     def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Scores:
         """Scores against the first clip; a candidate whose poses are not finite has fitness -inf and IoU 0."""
-        return self.score(jnp.asarray(poses, jnp.float32), batch, [len(batch)])[0]
+        return self.score(poses, batch, [len(batch)])[0]
 
     def score(
-        self, poses: Float[Array, "rows frames objects 7"], batch: SceneBatch, counts: Sequence[int]
+        self, poses: Float[Array | np.ndarray, "rows frames objects 7"], batch: SceneBatch, counts: Sequence[int]
     ) -> list[Scores]:
         """Scores of every clip's candidates.
 
@@ -151,43 +155,74 @@ class GridScorer:
           batch: the candidates, without further rows.
           counts: how many each clip has; one a clip.
         """
-        rows, clip, places = _layout(counts, len(batch))
-        arrays = (batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
-        kept = tuple(jnp.asarray(np.asarray(a, np.float32)[rows]) for a in arrays)
-        totals, bad = _scored(
-            self.shapes, self.image, self.moving_only, poses, jnp.asarray(rows), *kept, jnp.asarray(clip), self._clips
-        )
-        totals, bad = np.asarray(totals, np.float64), np.asarray(bad)
+        layout = self._layout(tuple(counts), len(batch))
+        room = max(len(poses), layout.rows)
+        columns = (batch.size.reshape(len(batch), -1), batch.camera_position, batch.camera_pitch, batch.camera_fovy)
+        seen_from = np.zeros((room, 3 * len(self.shapes) + 5), np.float32)
+        seen_from[: len(batch)] = np.column_stack(columns)
+        if len(poses) < room:
+            poses = np.concatenate([poses, np.zeros((room - len(poses), *poses.shape[1:]), np.float32)])
+        shown = jnp.asarray(poses, jnp.float32), jnp.asarray(seen_from)
+        static = (self.shapes, self.image, self.moving_only, layout.chunk)
+        totals = np.asarray(_scored(*static, *shown, layout.row, layout.clip, self._clips), np.float64)
+        lost = totals[0, :, 0] < 0
+        totals = np.where(lost[:, None], -1.0 - totals, totals)
         result = []
-        for k, place in enumerate(places):
-            sums = _sums(totals[:, place], self._observed[k], len(self.shapes))
-            scores = scores_from_sums(sums, self.weights[k])
-            lost = bad[place]
-            fitness, iou = np.where(lost, -np.inf, scores.fitness), np.where(lost, 0.0, scores.iou)
+        for k, place in enumerate(layout.places):
+            scores = scores_from_sums(_sums(totals[:, place], self._observed[k], len(self.shapes)), self.weights[k])
+            fitness = np.where(lost[place], -np.inf, scores.fitness)
+            iou = np.where(lost[place], 0.0, scores.iou)
             result.append(dataclasses.replace(scores, fitness=fitness, iou=iou))
         return result
 
+    def _layout(self, counts: tuple[int, ...], total: int) -> _Layout:
+        if sum(counts) != total or len(counts) != len(self._observed):
+            raise ValueError(f"counts add up to {sum(counts)}; expected the batch's {total}, and one a clip")
+        if counts not in self._layouts:
+            self._layouts.clear()
+            self._layouts[counts] = _laid_out(counts)
+        return self._layouts[counts]
 
-def _layout(counts: Sequence[int], total: int) -> tuple[np.ndarray, np.ndarray, list[slice]]:
-    """(row of each place, clip of each chunk, places of each clip): every clip padded to whole chunks, the chunks to few
-    numbers of them."""
-    if sum(counts) != total:
-        raise ValueError(f"counts add up to {sum(counts)}; expected the batch's {total}")
+
+@dataclasses.dataclass(frozen=True)
+class _Layout:
+    """Where candidates go: every clip padded to whole chunks, the chunks to few numbers of them.
+
+    Attributes:
+      rows: rows of the candidates that poses are padded to, if there are fewer.
+      chunk: candidates in a chunk.
+      row: of the candidate in each place.
+      clip: of each chunk.
+      places: of each clip's candidates.
+    """
+
+    rows: int
+    chunk: int
+    row: Int[Array, "places"]
+    clip: Int[Array, "chunks"]
+    places: list[slice]
+
+
+def _laid_out(counts: tuple[int, ...]) -> _Layout:
+    total = sum(counts)
+    fitting = (c for c in CHUNKS if sum(-(-count // c) * c for count in counts) <= SPARE * total)
+    chunk = next(fitting, CHUNKS[-1])
     rows, clip, places, first = [], [], [], 0
     for k, count in enumerate(counts):
-        chunks = -(-count // CHUNK)
-        places.append(slice(len(clip) * CHUNK, len(clip) * CHUNK + count))
-        rows.append(first + np.minimum(np.arange(chunks * CHUNK), max(count - 1, 0)))
+        chunks = -(-count // chunk)
+        places.append(slice(len(clip) * chunk, len(clip) * chunk + count))
+        rows.append(first + np.minimum(np.arange(chunks * chunk), max(count - 1, 0)))
         clip += [k] * chunks
         first += count
-    spare = _chunk_bucket(len(clip)) - len(clip)
-    rows.append(np.zeros(spare * CHUNK, np.int64))
-    return np.concatenate(rows).astype(np.int32), np.array(clip + [0] * spare, np.int32), places
+    spare = _few(len(clip)) - len(clip)
+    rows.append(np.zeros(spare * chunk, np.int64))
+    row = jnp.asarray(np.concatenate(rows).astype(np.int32))
+    return _Layout(16 * _few(-(-total // 16)), chunk, row, jnp.asarray(np.array(clip + [0] * spare, np.int32)), places)
 
 
-def _chunk_bucket(count: int) -> int:
-    """The next of few numbers of chunks: at most an eighth of them is spare."""
-    step = max(1, 1 << max(count.bit_length() - 4, 0))
+def _few(count: int) -> int:
+    """The next of few numbers, at most an eighth more."""
+    step = 1 << max(count.bit_length() - 4, 0)
     return -(-count // step) * step
 
 
@@ -222,42 +257,43 @@ def _sums(totals: Float[np.ndarray, "sums batch frames"], seen: dict[str, np.nda
     )
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
 def _scored(
     shapes: tuple[Shape, ...],
     image: tuple[int, int],
     moving_only: bool,
+    chunk: int,
     poses: Float[Array, "rows frames objects 7"],
+    seen_from: Float[Array, "rows values"],
     row: Int[Array, "places"],
-    size: Float[Array, "places objects 3"],
-    position: Float[Array, "places 3"],
-    pitch: Float[Array, "places"],
-    fovy: Float[Array, "places"],
     clip: Int[Array, "chunks"],
     clips: _Clips,
-) -> tuple[Float[Array, "sums places frames"], Bool[Array, "places"]]:
-    """(sums, whether a candidate diverged)."""
-    poses = poses[row]
+) -> Float[Array, "sums places frames"]:
+    """Sums; -1 minus them of a candidate that diverged. ``seen_from``: sizes, the camera's place, pitch, field of view."""
+    poses, seen_from = poses[row], seen_from[row]
     places, length = poses.shape[:2]
     bad = ~jnp.isfinite(poses).all((1, 2, 3)) | (jnp.abs(poses[..., :3]) > FARTHEST).any((1, 2, 3))
     poses = jnp.where(bad[:, None, None, None], jnp.array(AWAY, jnp.float32), poses)
-    frames = make_frames(poses, size, position, pitch, fovy, image[1])
-    chunked = jax.tree.map(lambda a: a.reshape(len(clip), CHUNK * length, *a.shape[1:]), frames)
+    size, position, pitch, fovy = jnp.split(seen_from, (3 * len(shapes), 3 * len(shapes) + 3, 3 * len(shapes) + 4), 1)
+    size = size.reshape(places, len(shapes), 3)
+    frames = make_frames(poses, size, position, pitch[:, 0], fovy[:, 0], image[1])
+    chunked = jax.tree.map(lambda a: a.reshape(len(clip), chunk * length, *a.shape[1:]), frames)
 
     def one(part: tuple[Frames, Array]) -> Array:
         return _chunk_sums(shapes, image, moving_only, part[0], clips, part[1], length)
 
-    totals = jax.lax.map(one, (chunked, clip))  # (chunks, sums, CHUNK * frames)
-    return jnp.moveaxis(totals, 1, 0).reshape(-1, places, length), bad
+    totals = jax.lax.map(one, (chunked, clip))  # (chunks, sums, frames of a chunk)
+    totals = jnp.moveaxis(totals, 1, 0).reshape(-1, places, length)
+    return jnp.where(bad[:, None], -1.0 - totals, totals)
 
 
 def _chunk_sums(shapes, image, moving_only, frames: Frames, clips: _Clips, clip: Array, length: int) -> Array:
-    """(sums, frames of CHUNK candidates): intersection, predicted, error, the same on objects, each object's two."""
-    samples = clips.x.shape[0]
+    """(sums, frames of a chunk): intersection, predicted, error, the same on objects, each object's two."""
+    samples, count = clips.x.shape[0], frames.height.shape[0] // length
 
     def seen_in(frame_major: Array) -> Array:
         one = jax.lax.dynamic_index_in_dim(frame_major, clip, keepdims=False)
-        return jnp.broadcast_to(one, (CHUNK, length, samples)).reshape(CHUNK * length, samples)
+        return jnp.broadcast_to(one, (count, length, samples)).reshape(count * length, samples)
 
     seen, seen_x, seen_y = seen_in(clips.ids), seen_in(clips.flow_x), seen_in(clips.flow_y)
     x, y = (jnp.broadcast_to(a, seen.shape) for a in (clips.x, clips.y))
