@@ -141,6 +141,10 @@ class ClipFit:
             columns.append(self.rigid(self._loose.kicks, None, 1e9 / slackness) * slackness)
         self._columns = np.concatenate(columns).T
 
+    def forget_slack(self, noise: Noise) -> None:
+        """Contacts may not err any more."""
+        self.noise, self._loose, self._columns, self._slacks = noise, None, None, {}
+
     def _change(self, moved: Prediction, still: Prediction) -> Parts:
         """From one prediction to others [px], zero where nothing was measured."""
         return Parts(

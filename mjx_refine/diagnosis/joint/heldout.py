@@ -7,6 +7,7 @@ is fitted, on its first ``EARLY`` part, and the rest of it is foretold. No frame
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -38,6 +39,9 @@ FEW = 3
 
 BOOTSTRAP = 1000
 
+BEYOND, MOST = 2.0, 0.75
+"""Multiple of what may be off that errors must be, in this part of the clips, for something to be missing."""
+
 
 def split(count: int, seed: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Which clips are fitted and which are judged: half and half, at random, the first always fitted since it is shown."""
@@ -60,12 +64,14 @@ class Foretold:
       energy: mean square error by later frame [noise widths squared].
       likelihood: logarithm of how likely the later frames were, up to a constant of the clip.
       floor: root mean square error that noise, and what is not known of the start, would give if all else were right.
+      excused: ditto if contacts err as much as the fitted clips' do; NaN where that was not asked for.
     """
 
     fit: Fit
     energy: Float[np.ndarray, "later"]
     likelihood: float
     floor: float
+    excused: float = math.nan
 
     @property
     def error(self) -> float:
@@ -114,6 +120,26 @@ def _foretold(clip: ClipFit, fit: Fit, early: np.ndarray, seed: int) -> Foretold
     return Foretold(fit, _by_frame(clip, counts * rows[0] ** 2, counts)[~early], likelihood, floor)
 
 
+def excused(clip: ClipFit, told: Foretold, early: np.ndarray, slackness: float) -> Foretold:
+    """With how far contacts may take the later frames off, which nothing else is to be blamed for."""
+    before = clip.noise
+    clip.slackness = slackness
+    clip.allow_slack(told.fit)
+    blur, columns = np.concatenate([w.ravel() for w in _squares(clip)]), clip.slack_columns
+    clip.forget_slack(before)
+    plain = np.concatenate([w.ravel() for w in _squares(clip)])
+    counts = counts_of(clip) * clip.kept(~early)
+    # Columns are in widths of the blurred noise, times the root of the count.
+    wide = (columns**2).sum(1) / np.maximum(counts_of(clip), 1e-12) * blur / plain + (blur - plain) / plain
+    more = float((counts * np.minimum(wide, WIDE**2)).sum() / max(float(counts.sum()), 1e-9))
+    return dataclasses.replace(told, excused=float(np.sqrt(told.floor**2 + more)))
+
+
+def _squares(clip: ClipFit) -> list[np.ndarray]:
+    """Variances of the noise, in the measurements' shapes."""
+    return [np.broadcast_to(w, part.shape) ** 2.0 for w, part in zip(clip.widths, clip.measured.parts, strict=True)]
+
+
 def _by_frame(clip: ClipFit, energy: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, "frames"]:
     """Mean square of each frame's residuals."""
     sums = []
@@ -154,6 +180,17 @@ class Outside:
     def closed(self) -> float:
         """(before - after) / (before - floor)."""
         return _closed(*self.numbers)
+
+    @property
+    def excused(self) -> float:
+        """Median over clips of what noise, starts and contacts may do to the errors before [noise widths]."""
+        return float(np.median([f.excused for f in self.before]))
+
+    @property
+    def inexplicable(self) -> bool:
+        """Whether the base model foretells most clips much worse than all that may be off."""
+        far = [f.error > BEYOND * f.excused for f in self.before]
+        return float(np.mean(far)) >= MOST
 
     def sure(self, seed: int, share: float = 0.95) -> bool:
         """Whether the gain is no accident of which clips were judged (bootstrap over them)."""

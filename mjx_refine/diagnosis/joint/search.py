@@ -10,7 +10,7 @@ import numpy as np
 from mjx_refine.diagnosis.fit import Fit
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.screen import JointScreen
-from mjx_refine.diagnosis.joint.slack import set_slackness
+from mjx_refine.diagnosis.joint.slack import set_slackness, with_slackness
 from mjx_refine.diagnosis.screen import Lead
 from mjx_refine.diagnosis.search import DOUBT, SECOND_PROMISE, Told, chosen_of, target_name
 from mjx_refine.effects import catalogue
@@ -99,25 +99,27 @@ def compare_together(
     """
     told("base model")
     plain = base = clips.restarted(begin(), seed, GOOD)
-    impacts, slackness = 0, 1.0
-    for _ in range(2):
-        impacts, slackness = _allow(clips, base, seed)
-        base = clips.restarted(clips.fit(base.hypothesis, base.z, 10), seed, GOOD)
+    _allow(clips, base, seed)
+    told("how much contacts err")
+    base, slackness = with_slackness(clips, base)
+    impacts = _allow(clips, base, seed)
+    set_slackness(clips, slackness)
+    base = clips.restarted(clips.fit(base.hypothesis, base.z, 10), seed, GOOD)
     names = [name for name in catalogue() if name not in without]
     base, singles = _singles(clips, base, seen, names, told)
     pairs = _pairs(clips, base, singles, seen, names, told)
     return JointCompared(plain, base, singles, pairs, impacts, slackness)
 
 
-def _allow(clips: Clips, base: JointFit, seed: int) -> tuple[int, float]:
-    """Sets noise, chaos and slack of every clip from the base model's fit; (impacts, slackness)."""
+def _allow(clips: Clips, base: JointFit, seed: int) -> int:
+    """Sets noise, chaos and slack of every clip from the base model's fit; returns how many impacts there are."""
     impacts = 0
     for c, (clip, part) in enumerate(zip(clips.clips, base.parts, strict=True)):
         clip.settle_noise(part)
         hypothesis, z = clips.own(base, c)
         clip.allow_chaos(clip.at(hypothesis, z), seed)
         impacts += clip.allow_slack(part)
-    return impacts, set_slackness(clips.clips, base.parts)
+    return impacts
 
 
 def _singles(

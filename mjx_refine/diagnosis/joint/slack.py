@@ -1,53 +1,45 @@
-"""How much contacts may err, told by several clips: the slackness under which the base model's residuals are likeliest."""
+"""How much contacts may err, told by several clips: the slackness under which their measurements are likeliest."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
+from mjx_refine.diagnosis.fit import ClipFit
 from mjx_refine.diagnosis.joint.counts import counts_of
+from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 
-GRID = (0.0, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
+GRID = (0.0, 1 / 4, 1.0)
 """Multiples of what contacts may err in one clip alone, which knows no better."""
 
+ITERATIONS = 8
 
-def set_slackness(clips: Sequence[ClipFit], fits: Sequence[Fit]) -> float:
-    """Sets the likeliest of ``GRID``, by the residuals that fits leave, and returns it.
+
+def with_slackness(clips: Clips, fit: JointFit) -> tuple[JointFit, float]:
+    """Fits the base model with every slackness of ``GRID`` and keeps the likeliest; (its fit, the slackness).
 
     Residuals r of standard deviation one, with errors of standard deviation one along columns C, have the covariance
-    I + C C'; its likelihood is compared over how much the columns, and the uncertain moments of impacts, are scaled.
+    I + C C'. Its determinant is the price of slack: the evidence of a fit lacks it, since it is the same for all effects.
     """
-    away = [_away(clip, fit) for clip, fit in zip(clips, fits, strict=True)]
-    values = []
+    found = []
     for slackness in GRID:
-        for clip in clips:
-            clip.set_slackness(slackness)
-        values.append(sum(_likelihood(clip, distances) for clip, distances in zip(clips, away, strict=True)))
-    best = GRID[int(np.argmax(values))]
-    for clip in clips:
-        clip.set_slackness(best)
-    return best
+        set_slackness(clips, slackness)
+        one = clips.fit(fit.hypothesis, fit.z, ITERATIONS)
+        found.append((one.evidence - sum(map(_volume, clips.clips)), one, slackness))
+    _, best, slackness = max(found, key=lambda told: told[0])
+    set_slackness(clips, slackness)
+    return best, slackness
 
 
-def _away(clip: ClipFit, fit: Fit):
-    batch = fit.hypothesis.batch(fit.z[None])
-    return clip.distances(clip.predictor(clip.poses(fit.hypothesis, fit.z[None]), batch))
+def set_slackness(clips: Clips, slackness: float) -> None:
+    """The same for all clips."""
+    for clip in clips.clips:
+        clip.set_slackness(slackness)
 
 
-def _likelihood(clip: ClipFit, distances) -> float:
-    """Logarithm of it, up to a constant of the clip."""
-    residual = clip.rigid(distances, None, SCALE)[0]
-    basis, size, _ = np.linalg.svd(clip.slack_columns, full_matrices=False)
-    along = (basis.T @ residual) ** 2
-    wide = 1.0 + size**2
-    explained = float((along * (1.0 - 1.0 / wide)).sum())
+def _volume(clip: ClipFit) -> float:
+    """Half the logarithm of the determinant of the measurements' covariance, up to a constant of the clip."""
+    size = np.linalg.svd(clip.slack_columns, compute_uv=False)
     sigma = np.concatenate(
-        [
-            np.broadcast_to(width, part.shape).ravel()
-            for width, part in zip(clip.widths, clip.measured.parts, strict=True)
-        ]
+        [np.broadcast_to(w, part.shape).ravel() for w, part in zip(clip.widths, clip.measured.parts, strict=True)]
     )
-    volume = float((counts_of(clip) * np.log(sigma)).sum()) + 0.5 * float(np.log(wide).sum())
-    return -0.5 * (float(residual @ residual) - explained) - volume
+    return float((counts_of(clip) * np.log(sigma)).sum()) + 0.5 * float(np.log1p(size**2).sum())

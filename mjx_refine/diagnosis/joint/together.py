@@ -12,9 +12,10 @@ from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.joint.answer import Said, ranked, said, to_judge
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
-from mjx_refine.diagnosis.joint.heldout import Foretold, Outside, early_part, foretell, split
+from mjx_refine.diagnosis.joint.heldout import Foretold, Outside, early_part, excused, foretell, split
 from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis
 from mjx_refine.diagnosis.joint.search import JointCandidate, JointCompared, Seen, compare_together
+from mjx_refine.diagnosis.joint.slack import GRID
 from mjx_refine.diagnosis.result import ClipGap, Diagnosis, Gap, Place, PoseErrors
 from mjx_refine.diagnosis.verdict import LITTLE
 from mjx_refine.diagnosis.where import places_of
@@ -195,7 +196,10 @@ def _outside(set_up: SetUp, compared: JointCompared, judged, seed: int, told) ->
         return tuple(rows)
 
     told("held-out clips")
-    before = foretold(compared.base)
+    before = tuple(
+        excused(set_up.clips[k], one, early_part(set_up.time(k)), compared.slackness)
+        for k, one in zip(judged, foretold(compared.base), strict=True)
+    )
     result = []
     for candidate in to_judge(compared):
         told(f"held-out clips, {' and '.join(candidate.names)}")
@@ -305,7 +309,9 @@ def _notes(course: Course) -> list[str]:
     if compared.impacts:
         notes.append(
             f"{compared.impacts} impacts may each err by {8 * compared.slackness:.2g} % of their change of velocity before "
-            "anything else is blamed, which is likeliest by the fitted clips' residuals."
+            f"anything else is blamed, the likeliest of {', '.join(f'{8 * s:g}' for s in GRID)} by the fitted clips. Of the "
+            f"held-out error of {course.judging.numbers[0]:.3g} noise widths, {course.judging.excused:.3g} are what that, "
+            "noise, and what is not known of the starts may do (medians)."
         )
     for one in (c for c in told.refuted if c.lead > LITTLE):
         notes.append(
