@@ -19,6 +19,7 @@ import dataclasses
 import os
 import platform
 import sys
+import tarfile
 import tempfile
 import time
 from pathlib import Path
@@ -26,10 +27,9 @@ from pathlib import Path
 import numpy as np
 
 from mjx_refine import GenerateOptions, InputError, Record, generate_scenes, parse_scenes, read_records
+from mjx_refine.children import cores
 from mjx_refine.compile_cache import enable_cache
 from mjx_refine.generate import GenerateProgress, Summary, replayed
-from mjx_refine.generate.run import cores
-from mjx_refine.simulate import simulate
 
 LEAST_IOU = 0.9999
 """With ``refine simulate``."""
@@ -82,7 +82,8 @@ def report(summary: Summary) -> None:
         f"{name} {seconds / summary.made * 1e3:.1f} ms ({seconds / total:.0%})"
         for name, seconds in sorted(tally.seconds.items(), key=lambda part: -part[1])
     )
-    print(f"time a scene, summed over processes: {parts}")
+    print(f"time a scene, summed over processes: {total / summary.made * 1e3:.1f} ms: {parts}")
+    print(f"processor time a scene: {tally.processor / summary.made * 1e3:.1f} ms")
     print(f"{tally.proposals} scenes proposed; of those that reached a filter, passed:")
     for name, told in tally.rates().items():
         print(f"  {name:<10} {told['passed']:>8} of {told['seen']:>8}  {told['rate']:.1%}")
@@ -143,6 +144,8 @@ class Compared:
 
 def compared(record: Record) -> Compared:
     """Simulates the record's text again."""
+    from mjx_refine.simulate import simulate
+
     scene = parse_scenes(record.text, record.key)[0]
     motion, pictures = replayed(scene)
     again = dataclasses.replace(record, pictures=pictures, motion=motion)
@@ -172,18 +175,26 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
     return float(((a == b) & either).sum() / max(either.sum(), 1))
 
 
+def keys_of(path: Path) -> list[str]:
+    """Of the records of a shard, in order."""
+    with tarfile.open(path, "r:") as archive:
+        return list(dict.fromkeys(name.partition(".")[0] for name in archive.getnames()))
+
+
 def check(arguments: argparse.Namespace) -> int:
     """Re-simulates records drawn at random."""
     enable_cache()
-    total = sum(1 for _ in read_records(arguments.folder))
+    there = [(path, key) for path in sorted(arguments.folder.glob("*.tar")) for key in keys_of(path)]
+    total = len(there)
     count = min(arguments.count, total)
-    chosen = set(np.random.default_rng(arguments.seed).choice(total, count, replace=False).tolist())
+    chosen: dict[Path, set[str]] = {}
+    for number in sorted(np.random.default_rng(arguments.seed).choice(total, count, replace=False).tolist()):
+        chosen.setdefault(there[number][0], set()).add(there[number][1])
     began, told = time.perf_counter(), []
-    for number, record in enumerate(read_records(arguments.folder)):
-        if number in chosen:
-            told.append(compared(record))
-            if not told[-1].sound:
-                print(f"record {record.key}: {told[-1]}")
+    for record in (record for path, keys in chosen.items() for record in read_records(path, keys=keys)):
+        told.append(compared(record))
+        if not told[-1].sound:
+            print(f"record {record.key}: {told[-1]}")
     sound = sum(one.sound for one in told)
     print(machine())
     print(

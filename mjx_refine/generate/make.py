@@ -10,14 +10,14 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from mjx_refine.batch import SceneBatch, batch_from_scenes
+from mjx_refine.batch import batch_from_scenes
 from mjx_refine.errors import InputError
 from mjx_refine.generate.options import LEAST_PIXELS, GenerateOptions
 from mjx_refine.generate.physics import Motion, RecordingSimulator
 from mjx_refine.generate.pictures import Clip, Pictures, draw_clips
 from mjx_refine.generate.record import Record, members
 from mjx_refine.generate.sample import Proposal, propose
-from mjx_refine.generate.tiles import bounding_boxes, nearest
+from mjx_refine.generate.tiles import nearest
 from mjx_refine.scene import Scene, Shape, dump_scene
 
 FILTERS = ("overlap", "diverged", "camera", "outside", "pixels")
@@ -43,7 +43,8 @@ class Tally:
       proposals: scenes proposed for them.
       rejected: by each filter.
       kinds: records by object types.
-      seconds: of the parts of the work.
+      seconds: of the parts of the work, by the clock.
+      processor: seconds that processors worked for all of it.
     """
 
     records: int = 0
@@ -51,11 +52,13 @@ class Tally:
     rejected: collections.Counter = dataclasses.field(default_factory=collections.Counter)
     kinds: collections.Counter = dataclasses.field(default_factory=collections.Counter)
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    processor: float = 0.0
 
     def add(self, other: Tally) -> None:
         """Counts ``other`` too."""
         self.records += other.records
         self.proposals += other.proposals
+        self.processor += other.processor
         self.rejected.update(other.rejected)
         self.kinds.update(other.kinds)
         for part, seconds in other.seconds.items():
@@ -175,9 +178,9 @@ class Maker:
             batch = batch[apart]
             for row, motion in enumerate(simulator.record(batch)):
                 proposal = proposals[places[apart[row]]]
-                reason = _rejected(motion, batch, row)
-                clip = None if reason else Clip(motion.qpos, batch, row)
-                candidates[places[apart[row]]] = Candidate(proposal, reason, motion, clip)
+                clip = Clip(motion.qpos, batch, row)
+                reason = _rejected(motion, clip)
+                candidates[places[apart[row]]] = Candidate(proposal, reason, motion, None if reason else clip)
         return candidates
 
     def _record(self, index: int, candidate: Candidate, tally: Tally) -> Record:
@@ -197,20 +200,19 @@ class Maker:
             return dataclasses.replace(record, seen=film(record, self.options, index))
 
 
-def _rejected(motion: Motion, batch: SceneBatch, row: int) -> str | None:
+def _rejected(motion: Motion, clip: Clip) -> str | None:
     """The first filter between overlap and pixels that a motion does not pass, or a bound on pixels that is too low."""
     if not motion.finite:
         return "diverged"
-    if nearest(motion.qpos, batch, row) < CLOSEST:
+    if nearest(motion.qpos, clip.batch, clip.row) < CLOSEST:
         return "camera"
-    boxes = bounding_boxes(motion.qpos, batch, row)
-    if np.count_nonzero(~boxes.seen) > 1:
+    if np.count_nonzero(~clip.bounds.seen) > 1:
         return "outside"
-    return "pixels" if boxes.pixels.sum(0).min() < LEAST_PIXELS else None
+    return "pixels" if clip.bounds.pixels.sum(1).min() < LEAST_PIXELS else None
 
 
 def replayed(scene: Scene) -> tuple[Motion, Pictures]:
     """Simulates and draws a record's scene again; on one kind of machine nothing differs from the record."""
     batch = batch_from_scenes([scene])
     motion = RecordingSimulator(scene.shapes).record(batch)[0]
-    return motion, draw_clips([Clip(motion.qpos, batch, 0)])[0]
+    return motion, next(draw_clips([Clip(motion.qpos, batch, 0)]))

@@ -132,6 +132,7 @@ def told_summary(summary: Summary, options: GenerateOptions, shard: tuple[int, i
             "records": summary.made,
             "seconds": summary.seconds,
             "device": summary.device,
+            "processor_seconds": round(tally.processor, 3),
             "parts": {name: round(seconds, 3) for name, seconds in sorted(tally.seconds.items())},
         },
     }

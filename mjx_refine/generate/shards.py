@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 import tarfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from pathlib import Path
 
 import mujoco
@@ -131,12 +131,13 @@ def finished(out: Path, options: GenerateOptions, resume: bool) -> dict[int, dic
     return found
 
 
-def read_records(source: str | Path, split: str | None = None) -> Iterator[Record]:
+def read_records(source: str | Path, split: str | None = None, keys: Container[str] | None = None) -> Iterator[Record]:
     """The records of a shard, or of all shards in a folder, in order, one at a time.
 
     Args:
       source: a ``.tar`` file or a folder.
       split: of a folder, only this one.
+      keys: only the records with these; what others hold is not read.
 
     Raises:
       InputError: there are none, or one is damaged.
@@ -152,15 +153,17 @@ def read_records(source: str | Path, split: str | None = None) -> Iterator[Recor
         paths = [source]
     else:
         raise InputError(f"{source}: no such file or folder; expected a shard or a folder of shards")
-    return (record for path in paths for record in _records_of(path))
+    return (record for path in paths for record in _records_of(path, keys))
 
 
-def _records_of(path: Path) -> Iterator[Record]:
+def _records_of(path: Path, keys: Container[str] | None) -> Iterator[Record]:
     key, contents = None, {}
     try:
         with tarfile.open(path, "r:") as archive:
             for info in archive:
                 this, _, name = info.name.partition(".")
+                if keys is not None and this not in keys:
+                    continue
                 if this != key and key is not None:
                     yield from_members(key, contents, str(path))
                     contents = {}

@@ -70,20 +70,32 @@ def _body_entry(body: Body) -> dict:
     return entry
 
 
-class _Dumper(yaml.SafeDumper):
+def _represent_list(dumper: yaml.SafeDumper, data: list) -> yaml.Node:
     """Lists of numbers in one line, mappings one key a line."""
-
-    def represent_list_inline(self, data: list) -> yaml.Node:
-        scalars = all(isinstance(v, int | float) for v in data)
-        return self.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=scalars)
+    scalars = all(isinstance(v, int | float) for v in data)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=scalars)
 
 
-_Dumper.add_representer(list, _Dumper.represent_list_inline)
+class _Dumper(yaml.SafeDumper):
+    """Writes what names people give."""
+
+
+_Quick: type = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+
+class _QuickDumper(_Quick):
+    """By libyaml, where PyYAML has it; it escapes some letters beyond ASCII."""
+
+
+for _dumper in (_Dumper, _QuickDumper):
+    _dumper.add_representer(list, _represent_list)
 
 
 def dump_scene(scene: Scene) -> str:
     """The scene as YAML text; numbers keep every digit."""
-    return yaml.dump(scene_entries(scene), Dumper=_Dumper, sort_keys=False, width=4096, allow_unicode=True)
+    plain = all(name.isascii() and name.isprintable() for name in scene.names)
+    dumper = _QuickDumper if plain and not scene.effects else _Dumper
+    return yaml.dump(scene_entries(scene), Dumper=dumper, sort_keys=False, width=4096, allow_unicode=True)
 
 
 def save_scene(path: str | os.PathLike, scene: Scene) -> Path:

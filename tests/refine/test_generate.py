@@ -1,6 +1,8 @@
 """Generated scenes: what is sampled, simulated, drawn and kept, against MuJoCo and the plain drawing."""
 
 import dataclasses
+import io
+import zipfile
 
 import mujoco
 import numpy as np
@@ -9,15 +11,17 @@ import pytest
 from mjx_refine import GenerateOptions, InputError, generate_scenes, read_records
 from mjx_refine.batch import batch_from_scenes
 from mjx_refine.generate import HELD_OUT, SPLITS, Seen, replayed
+from mjx_refine.generate.casting import slots_of
 from mjx_refine.generate.make import CLOSEST, FILTERS, Maker, Tally, _rejected
+from mjx_refine.generate.npz import packed
 from mjx_refine.generate.options import LEAST_PIXELS, SIZE, combinations
 from mjx_refine.generate.physics import RecordingSimulator
-from mjx_refine.generate.pictures import Clip, draw_clips, expanded, slots_of
+from mjx_refine.generate.pictures import Clip, draw_clips, expanded
 from mjx_refine.generate.record import differences, from_jpeg, from_members, jpeg, members, summed
 from mjx_refine.generate.rgb import _add_camera, _dress, check_renderer, film
 from mjx_refine.generate.sample import half_height, propose, rotated, shapes_of
-from mjx_refine.generate.tiles import SIDE, bounding_boxes
-from mjx_refine.scene import Body, Camera, Scene, dump_scene, parse_scenes
+from mjx_refine.generate.tiles import HIGH, WIDE
+from mjx_refine.scene import Body, Camera, Scene, dump_scene, parse_scenes, write
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.sim.model import SUBSTEPS, apply_fields, build_spec, contact_pairs, initial_state, model_fields
 from mjx_refine.simulate import simulate
@@ -52,6 +56,13 @@ def test_the_text_is_the_scene_that_is_simulated(split):
         proposal = propose(GenerateOptions(split=split), index, 0)
         assert parse_scenes(dump_scene(proposal.written))[0] == proposal.scene
         assert proposal.scene.camera.position[:2] == (0.0, -2.0)
+
+
+def test_the_text_is_the_same_without_libyaml(monkeypatch):
+    scenes = [propose(GenerateOptions(split=split), index, 0).written for split in SPLITS for index in range(8)]
+    quick = [dump_scene(scene) for scene in scenes]
+    monkeypatch.setattr(write, "_QuickDumper", write._Dumper)
+    assert [dump_scene(scene) for scene in scenes] == quick
 
 
 def test_splits_have_the_objects_that_they_should():
@@ -156,8 +167,15 @@ def crowd():
     return Scene(tuple(bodies), Camera((0.0, -2.0, 2.5), 50.0, 45.0))
 
 
+def four(seed, count):
+    """Scenes of one kind with every shape, since the plain drawing is compiled for each kind."""
+    options = GenerateOptions(seed=seed, split="compositional")
+    numbers = [index for index in range(20 * count) if shapes_of(options, index) == HELD_OUT[2]]
+    return [propose(options, index, 0).scene for index in numbers[:count]]
+
+
 def test_masks_and_flow_are_the_plain_drawing_s():
-    scenes = [crowd(), *(propose(GenerateOptions(seed=3), index, 0).scene for index in range(5))]
+    scenes = [crowd(), *four(3, 5)]
     clips = [clip_of(scene) for scene in scenes]
     for clip, pictures in zip(clips, draw_clips(clips), strict=True):
         masks, flow = expanded(pictures.runs, pictures.flow)
@@ -172,16 +190,16 @@ def test_masks_and_flow_are_the_plain_drawing_s():
 
 def test_a_clip_s_pixels_do_not_depend_on_the_others():
     clips = [clip_of(propose(GenerateOptions(seed=4, objects=6), index, 0).scene) for index in range(6)]
-    together = draw_clips(clips)
+    together = list(draw_clips(clips))
     for clip, pictures in zip(clips, together, strict=True):
-        alone = draw_clips([clip])[0]
+        alone = next(draw_clips([clip]))
         np.testing.assert_array_equal(alone.runs, pictures.runs)
         np.testing.assert_array_equal(alone.flow, pictures.flow)
 
 
 def test_more_clips_than_are_prepared_together():
     clip = clip_of(crowd())
-    many = draw_clips([clip] * 45)
+    many = list(draw_clips([clip] * 45))
     assert len(many) == 45
     assert all(np.array_equal(other.runs, many[0].runs) for other in many)
 
@@ -189,32 +207,34 @@ def test_more_clips_than_are_prepared_together():
 def test_nothing_in_view_is_no_runs():
     scene = crowd()
     away = dataclasses.replace(scene, camera=Camera((0.0, 50.0, 2.5), 90.0, 45.0))
-    pictures = draw_clips([clip_of(away)])[0]
+    pictures = next(draw_clips([clip_of(away)]))
     assert pictures.runs.shape == (3, 0)
     assert pictures.flow.shape == (2, 0)
     assert not expanded(pictures.runs, pictures.flow)[0].any()
 
 
 def test_bounds_miss_no_pixel():
-    scenes = [crowd(), *(propose(GenerateOptions(seed=6, objects=5), index, 0).scene for index in range(6))]
+    scenes = [crowd(), *four(6, 8)]
     near = dataclasses.replace(crowd(), camera=Camera((0.2, -0.3, 1.0), 60.0, 70.0))
     for scene in [*scenes, near]:
         clip = clip_of(scene)
-        boxes = bounding_boxes(clip.qpos, clip.batch, 0)
+        bounds = clip.bounds
         masks, _ = draw(clip.qpos, clip.batch, SIZE)
-        tiles = masks.reshape(30, SIZE[1] // SIDE, SIDE, SIZE[0] // SIDE, SIDE).swapaxes(2, 3)
+        tiles = masks.reshape(30, SIZE[1] // HIGH, HIGH, SIZE[0] // WIDE, WIDE).swapaxes(2, 3)
         for n in range(len(scene.objects)):
-            assert boxes.touched[n][(tiles == n + 1).any((3, 4))].all()
-            assert boxes.seen[n] or not (masks == n + 1).any()
-            assert np.all(boxes.pixels[:, n] >= (masks == n + 1).sum((1, 2)))
+            assert bounds.touched[n][(tiles == n + 1).any((3, 4))].all()
+            assert bounds.seen[n] or not (masks == n + 1).any()
+            assert np.all(bounds.pixels[n] >= (masks == n + 1).sum((1, 2)))
 
 
 def test_slots_hold_every_object_once():
     for shapes in [kind for count in range(1, 7) for kind in combinations(count)]:
-        signature, slots = slots_of(shapes)
-        assert [signature[slots.index(k)] for k in range(len(shapes))] == list(shapes)
-        assert sorted(k for k in slots if k is not None) == list(range(len(shapes)))
-    assert len({slots_of(kind)[0] for count in range(1, 7) for kind in combinations(count)}) <= 13
+        for few in (True, False):
+            signature, slots = slots_of(shapes, few)
+            assert [signature[slots.index(k)] for k in range(len(shapes))] == list(shapes)
+            assert sorted(k for k in slots if k is not None) == list(range(len(shapes)))
+    for few, most in ((True, 7), (False, 2)):
+        assert len({slots_of(kind, few)[0] for count in range(1, 7) for kind in combinations(count)}) <= most
 
 
 # Filters --------------------------------------------------------------------------------------------------------------
@@ -267,7 +287,8 @@ def moving(*bodies, camera=None):
 )
 def test_each_filter_rejects_what_it_should(scene, reason):
     batch = batch_from_scenes([scene])
-    assert _rejected(RecordingSimulator(scene.shapes).record(batch)[0], batch, 0) == reason
+    motion = RecordingSimulator(scene.shapes).record(batch)[0]
+    assert _rejected(motion, Clip(motion.qpos, batch, 0)) == reason
 
 
 def test_overlap_and_pixels_are_rejected():
@@ -324,6 +345,25 @@ def test_differences_are_undone():
     flow[:, ::7] = [[0.0], [-0.0]]
     np.testing.assert_array_equal(summed(differences(flow)).view(np.uint16), flow.view(np.uint16))
     assert summed(differences(flow[:, :0])).shape == (2, 0)
+
+
+def test_an_npz_is_what_numpy_reads():
+    arrays = {
+        "many": np.arange(70_000, dtype=np.int32).reshape(7, 1, -1),
+        "none": np.empty((0, 3), np.float16),
+        "one": np.float64(30.0),
+        "turned": np.arange(6.0).reshape(2, 3).T,
+    }
+    with zipfile.ZipFile(io.BytesIO(packed(arrays))) as archive:
+        assert archive.testzip() is None
+        assert all(info.compress_type == zipfile.ZIP_DEFLATED for info in archive.infolist())
+    with np.load(io.BytesIO(packed(arrays)), allow_pickle=False) as told:
+        assert told.files == list(arrays)
+        for name, array in arrays.items():
+            np.testing.assert_array_equal(told[name], array)
+            assert told[name].dtype == np.asarray(array).dtype
+    assert packed(arrays) == packed(dict(arrays))
+    assert len(packed({"zeros": np.zeros(10**6)})) < 20_000
 
 
 def test_an_observation_is_made_of_a_record(records):

@@ -58,6 +58,15 @@ def test_records_do_not_depend_on_the_size_of_shards(whole, tmp_path):
         np.testing.assert_array_equal(one.pictures.flow, other.pictures.flow)
 
 
+def test_records_of_some_keys(whole):
+    everything = list(read_records(whole))
+    for keys in (["00000001", "00000007"], [], ["no key"]):
+        some = list(read_records(whole, keys=keys))
+        assert [record.key for record in some] == [record.key for record in everything if record.key in keys]
+        for record in some:
+            np.testing.assert_array_equal(record.masks, everything[int(record.key)].masks)
+
+
 def test_a_run_goes_on_where_it_stopped(whole, tmp_path):
     out = tmp_path / "data"
     generate_scenes(4, out, OPTIONS, workers=0)
