@@ -128,8 +128,8 @@ class Maker:
         found: dict[int, Candidate] = {}
         attempts = dict.fromkeys(indices, 0)
         while attempts:
-            # The last few records are tried for several times at once, since a round has costs of its own.
-            ahead = min(max(1, BLOCK // (2 * len(attempts))), 4)
+            # The last records are tried for twice at once, since a round has costs of its own.
+            ahead = 2 if len(attempts) <= 2 else 1
             with tally.timing("sampling"):
                 asked = [(i, propose(self.options, i, a + k)) for i, a in attempts.items() for k in range(ahead)]
             judged = self._judged([proposal for _, proposal in asked], tally)
