@@ -139,6 +139,7 @@ def _singles(
         if other.cost > base.cost - 1.0:
             break
         base = other
+    _not_below(clips, base, fitted)
     _from_the_best(clips, base, fitted)
     found = [JointCandidate(fit, _lead(fit, base)) for fit in fitted.values()]
     return base, tuple(sorted(found, key=lambda c: -c.lead))
@@ -172,6 +173,19 @@ def _begin(clips: Clips, hypothesis, here: JointFit, lead: Lead, z: np.ndarray) 
     parts = (0.0, 0.1, 0.3, 0.6, 1.0) if lead.start.columns else (0.0, 0.3, 1.0)
     limited = np.clip(lead.shift, -10.0, 10.0)
     return clips.best_of(hypothesis, np.array([hypothesis.grown(here.z + a * limited, a * z) for a in parts]))
+
+
+def _not_below(clips: Clips, base: JointFit, fitted: dict[tuple[str, int], JointFit]) -> None:
+    """Effects whose fit is worse than the base model's, which they hold, once more from there."""
+    for key, fit in list(fitted.items()):
+        if fit.cost < base.cost:
+            continue
+        count = int(fit.hypothesis.terms[-1].free.sum())
+        last = fit.z[fit.hypothesis.count - count : fit.hypothesis.count]
+        points = np.array([fit.hypothesis.grown(base.z, part * last) for part in (0.0, 0.1, 0.3, 1.0)])
+        again = clips.fit(fit.hypothesis, clips.best_of(fit.hypothesis, points), 7)
+        if again.evidence > fit.evidence:
+            fitted[key] = again
 
 
 def _from_the_best(clips: Clips, base: JointFit, fitted: dict[tuple[str, int], JointFit]) -> None:
