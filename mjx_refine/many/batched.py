@@ -20,7 +20,7 @@ from mjx_refine.many.progress import ManyProgress
 from mjx_refine.many.work import SEARCHING, Prepared, told_of
 from mjx_refine.many.worker import MOST_FALSE_STARTS, UNGUARDED, Worker
 from mjx_refine.search import Options
-from mjx_refine.search.together import CANDIDATES, Member, Together
+from mjx_refine.search.together import CANDIDATES, DEVICE, Member, Together
 from mjx_refine.sim.backends import fastest, make_simulator
 
 log = logging.getLogger("mjx_refine")
@@ -83,6 +83,7 @@ class Batched:
           RuntimeError: workers end before they begin.
         """
         interval = sys.getswitchinterval()
+        enable_cache()
         try:
             while self.left:
                 self._hire()
@@ -205,7 +206,6 @@ class Batched:
                 self.parts[members[id(member)]] = SEARCHING * min(1.0, part)
 
         try:
-            enable_cache()
             ready = []
             for one in group:
                 try:
@@ -218,7 +218,9 @@ class Batched:
             backend = fastest(self.options.backend, candidates) if ready else self.backend
             log.info("%d clips of %s are searched together by %s", len(ready), "+".join(first.shapes), backend)
             if ready:
-                Together(ready, make_simulator(backend, first.shapes, first.fps), ended, going).run()
+                with DEVICE:
+                    simulator = make_simulator(backend, first.shapes, first.fps, quick=True)
+                Together(ready, simulator, ended, going).run()
         except _Stopped:
             return
         except Exception as error:

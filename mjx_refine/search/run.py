@@ -128,7 +128,7 @@ class Run:
             if backend != "mujoco":
                 backend = fastest(self.options.backend, self.options.population)
             with on_device():
-                simulator = make_simulator(backend, start.scene.shapes, self.problem.observation.fps)
+                simulator = make_simulator(backend, start.scene.shapes, self.problem.observation.fps, quick=True)
                 search = self._search(self._objective(start, space, simulator), mean, covariance)
             where = Searched(str(search.reason), simulator.name, simulator.device, time.monotonic() - began)
             elites += search.found

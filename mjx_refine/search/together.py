@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
@@ -30,6 +31,9 @@ CANDIDATES = 8192
 
 LEAST = 64
 """A batch that does not fit in memory and is no larger than this fails."""
+
+DEVICE = threading.RLock()
+"""One thread at a time uses the device: Warp builds and records its kernels for all of a process."""
 
 CHECKPOINT_SECONDS = 10.0
 """Between two checkpoints of a clip; what is lost is computed again."""
@@ -135,6 +139,7 @@ class Together:
 
     def run(self) -> None:
         """Runs all searches to their ends."""
+        count, generations = len(self.members), 0
         while self.members:
             parts = _parts(self._asked(), self.most)
             current = {_key(part): self._scorers.get(_key(part)) for part in parts}
@@ -142,6 +147,8 @@ class Together:
             for part in parts:
                 self._generation(part)
             self.going(self.members)
+            generations += 1
+        log.info("%d clips searched in %d generations, %.1f s", count, generations, time.monotonic() - self.began)
 
     def _asked(self) -> list[Asked]:
         """(member, its points, their candidates) of all that go on; the others leave."""
@@ -191,11 +198,12 @@ class Together:
     def _evaluated(self, part: list[Asked]) -> list[tuple[np.ndarray, Scores]]:
         """(costs, scores) of each member's points."""
         batch = concatenate([candidates for _, _, candidates in part])
-        scorer = self._scorer(part)
-        poses = launched(self.simulator, batch, scorer.length)
-        prices = price_of_overlap(self.reference, batch)  # while the device computes
         counts = [len(points) for _, points, _ in part]
-        scores = scorer.score(poses, batch, counts)
+        with DEVICE:
+            scorer = self._scorer(part)
+            poses = launched(self.simulator, batch, scorer.length)
+            prices = price_of_overlap(self.reference, batch)  # while the device computes
+            scores = scorer.score(poses, batch, counts)
         ends = np.cumsum(counts)[:-1]
         return [(price - one.fitness, one) for price, one in zip(np.split(prices, ends), scores, strict=True)]
 
