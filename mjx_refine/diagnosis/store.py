@@ -63,7 +63,7 @@ class Store:
         path = self._path(key)
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_atomic(path, lambda stream: np.savez(stream, **arrays))
+            write_atomic(path, lambda stream: np.savez(stream, **arrays))  # type: ignore[arg-type]
             self.kept += 1
 
     def clear(self) -> None:

@@ -158,7 +158,8 @@ def test_joint_residuals_and_derivatives_are_the_clips_own(set_up, names):
         alone, _ = clip.residuals(part, at)
         assert row == pytest.approx(alone, rel=1e-6, abs=1e-6)
         halves = halves + 0.5 * (alone**2).sum(1)
-    assert costs == pytest.approx(halves + 0.5 * (prior(told, z)[0] ** 2).sum(1), rel=1e-6)
+    price = prior(told, z)[0]  # type: ignore[arg-type]
+    assert costs == pytest.approx(halves + 0.5 * (price**2).sum(1), rel=1e-6)
     base = [row[0] for row in rows]
     for clip, part, at, row, jacobian in zip(
         set_up.clips, told.parts, told.split(z[0]), base, clips.jacobians(told, z[0], base), strict=True

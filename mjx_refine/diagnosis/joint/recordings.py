@@ -163,7 +163,7 @@ def _result(course: Course, set_up: Recordings, seed: int, began: float) -> Diag
     )
 
 
-def _root(errors: tuple[np.ndarray, np.ndarray], chosen=slice(None)) -> Errors:
+def _root(errors: tuple[np.ndarray, np.ndarray], chosen: slice | np.ndarray = slice(None)) -> Errors:
     values = [e[chosen][np.isfinite(e[chosen])] for e in errors]
     return Errors(*(float(np.sqrt(np.mean(v**2))) if v.size else math.nan for v in values))
 
