@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 
 import jax
@@ -67,10 +66,12 @@ def warp_renderer(kind: str, population: int, count: int, size: tuple[int, int],
     key = context.pytree()
     masks = jnp.asarray(simulate(KINDS[kind], size=size, frames=frames).masks.reshape(frames, -1) > 0)
 
+    # The camera stands still: its pose is computed once.
+    first = jax.vmap(lambda q: mjx.forward(m, empty.replace(qpos=q)))(poses[:population, 0].reshape(population, -1))
+
     @jax.jit
     def placed(qpos: Float[Array, "worlds positions"]):
-        data = jax.vmap(lambda q: mjx.kinematics(m, empty.replace(qpos=q)))(qpos)
-        return jax.vmap(functools.partial(mjx.camlight, m))(data) if hasattr(mjx, "camlight") else data
+        return jax.vmap(lambda data, q: mjx.kinematics(m, data.replace(qpos=q)))(first, qpos)
 
     @jax.jit
     def overlap(data, seen: Float[Array, "pixels"]):

@@ -135,16 +135,16 @@ class Together:
         self.reference = MujocoSimulator(first.shapes, first.fps, 1)
         self.most = CANDIDATES
         self.began = time.monotonic()
-        self._scorers: dict[tuple[int, ...], GridScorer] = {}
+        clips, weights = [m.ready.samples for m in members], [m.ready.options.weights for m in members]
+        with DEVICE:
+            self.scorer = GridScorer(first.shapes, clips, weights)
+        self.rows = {id(member): row for row, member in enumerate(members)}
 
     def run(self) -> None:
         """Runs all searches to their ends."""
         count, generations = len(self.members), 0
         while self.members:
-            parts = _parts(self._asked(), self.most)
-            current = {_key(part): self._scorers.get(_key(part)) for part in parts}
-            self._scorers = {key: scorer for key, scorer in current.items() if scorer is not None}
-            for part in parts:
+            for part in _parts(self._asked(), self.most):
                 self._generation(part)
             self.going(self.members)
             generations += 1
@@ -198,27 +198,16 @@ class Together:
     def _evaluated(self, part: list[Asked]) -> list[tuple[np.ndarray, Scores]]:
         """(costs, scores) of each member's points."""
         batch = concatenate([candidates for _, _, candidates in part])
-        counts = [len(points) for _, points, _ in part]
+        counts = [0] * len(self.rows)  # those that have left keep their places
+        for member, points, _ in part:
+            counts[self.rows[id(member)]] = len(points)
         with DEVICE:
-            scorer = self._scorer(part)
-            poses = launched(self.simulator, batch, scorer.length)
+            poses = launched(self.simulator, batch, self.scorer.length)
             prices = price_of_overlap(self.reference, batch)  # while the device computes
-            scores = scorer.score(poses, batch, counts)
-        ends = np.cumsum(counts)[:-1]
-        return [(price - one.fitness, one) for price, one in zip(np.split(prices, ends), scores, strict=True)]
-
-    def _scorer(self, part: list[Asked]) -> GridScorer:
-        """The members' clips on the device: put there when they are first searched together, and when one has left."""
-        key = _key(part)
-        if key not in self._scorers:
-            ready = [member.ready for member, _, _ in part]
-            clips, weights = [one.samples for one in ready], [one.options.weights for one in ready]
-            self._scorers[key] = GridScorer(ready[0].shapes, clips, weights)
-        return self._scorers[key]
-
-
-def _key(part: list[Asked]) -> tuple[int, ...]:
-    return tuple(id(member) for member, _, _ in part)
+            scores = self.scorer.score(poses, batch, counts)
+        own = np.split(prices, np.cumsum(counts)[:-1])
+        rows = [self.rows[id(member)] for member, _, _ in part]
+        return [(own[row] - scores[row].fitness, scores[row]) for row in rows]
 
 
 def _parts(asked: list[Asked], most: int) -> list[list[Asked]]:

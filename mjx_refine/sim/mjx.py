@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -29,9 +30,16 @@ def bucket(count: int) -> int:
     return next((size for size in BUCKETS if size >= count), -(-count // BUCKETS[-1]) * BUCKETS[-1])
 
 
-def padded(batch: SceneBatch, multiple: int = 1) -> SceneBatch:
-    """``batch`` with its last candidate repeated up to the next bucket, rounded up to a ``multiple``."""
-    size = -(-bucket(len(batch)) // multiple) * multiple
+def room(count: int, compiled: Iterable[int], multiple: int = 1) -> int:
+    """The batch size for ``count`` candidates: one that is compiled if it is not over four times as large (a batch's time
+    grows far less than its size), else the next bucket, rounded up to a ``multiple``."""
+    fitting = [size for size in compiled if count <= size <= 4 * count]
+    return min(fitting, default=-(-bucket(count) // multiple) * multiple)
+
+
+def padded(batch: SceneBatch, multiple: int = 1, compiled: Iterable[int] = ()) -> SceneBatch:
+    """``batch`` with its last candidate repeated up to its ``room``."""
+    size = room(len(batch), compiled, multiple)
     return batch[np.minimum(np.arange(size), len(batch) - 1)]
 
 
@@ -150,7 +158,7 @@ class MjxSimulator:
 
         For scenes without effects. What has diverged is not marked.
         """
-        full = padded(batch, len(self.devices))
+        full = padded(batch, len(self.devices), [size for size, length in self._programs if length == frames])
         qpos, qvel = initial_state(full)
         arguments = self.devices.dealt((leaves_of(full), jnp.asarray(qpos), jnp.asarray(qvel)))
         return self._program(arguments, frames)(*arguments)

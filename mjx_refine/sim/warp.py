@@ -145,7 +145,7 @@ class WarpSimulator:
 
         For scenes without effects. What has diverged is not marked.
         """
-        full = padded(batch)
+        full = padded(batch, compiled=[size for size, length in self._programs if length == frames])
         qpos, qvel = initial_state(full)
         arguments = (leaves_of(full), jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
         return self._program(arguments, frames)(*arguments)

@@ -9,11 +9,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from mjx_fitness import UNMATCHED, Scores, Sums, Weights, scores_from_sums
 
 from mjx_refine.batch import SceneBatch
@@ -28,6 +29,9 @@ CHUNKS = (128, 64, 32, 16)
 
 SPARE = 1.1
 """Padding may cost this factor; smaller chunks are taken where it costs more."""
+
+ROOMY = 2.0
+"""While clips leave, their room is kept up to this factor: what is compiled fits on."""
 
 AWAY = (0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0)
 """The pose of what is not to be seen."""
@@ -139,7 +143,9 @@ class GridScorer:
             **{name: jnp.asarray(np.stack([getattr(c, name) for c in kept])) for name in ("ids", "flow_x", "flow_y")},
         )
         self._layouts: dict[tuple[int, ...], _Layout] = {}
-        self._observed = [_observed(clip, len(shapes)) for clip in clips]
+        self._used: set[tuple[int, int, int]] = set()
+        observed = [_observed(clip, len(shapes)) for clip in clips]
+        self._observed = {name: np.stack([one[name] for one in observed]) for name in observed[0]}
 
     def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Scores:
         """Scores against the first clip; a candidate whose poses are not finite has fitness -inf and IoU 0."""
@@ -165,22 +171,26 @@ class GridScorer:
         shown = jnp.asarray(poses, jnp.float32), jnp.asarray(seen_from)
         static = (self.shapes, self.image, self.moving_only, layout.chunk)
         totals = np.asarray(_scored(*static, *shown, layout.row, layout.clip, self._clips), np.float64)
+        totals = totals[:, layout.place]
         lost = totals[0, :, 0] < 0
         totals = np.where(lost[:, None], -1.0 - totals, totals)
-        result = []
-        for k, place in enumerate(layout.places):
-            scores = scores_from_sums(_sums(totals[:, place], self._observed[k], len(self.shapes)), self.weights[k])
-            fitness = np.where(lost[place], -np.inf, scores.fitness)
-            iou = np.where(lost[place], 0.0, scores.iou)
-            result.append(dataclasses.replace(scores, fitness=fitness, iou=iou))
-        return result
+        seen = {name: values[layout.owner] for name, values in self._observed.items()}
+        sums = _sums(totals, seen, len(self.shapes))
+        return [_marked(one, gone) for one, gone in zip(self._scores(sums, counts), _split(lost, counts), strict=True)]
+
+    def _scores(self, sums: Sums, counts: Sequence[int]) -> list[Scores]:
+        """Scores by clip; at one go where all have the same weights."""
+        if all(weights == self.weights[0] for weights in self.weights):
+            return _by_clip(scores_from_sums(sums, self.weights[0]), counts)
+        parts = _by_clip(sums, counts)
+        return [scores_from_sums(one, weights) for one, weights in zip(parts, self.weights, strict=True)]
 
     def _layout(self, counts: tuple[int, ...], total: int) -> _Layout:
-        if sum(counts) != total or len(counts) != len(self._observed):
+        if sum(counts) != total or len(counts) != len(self.weights):
             raise ValueError(f"counts add up to {sum(counts)}; expected the batch's {total}, and one a clip")
         if counts not in self._layouts:
             self._layouts.clear()
-            self._layouts[counts] = _laid_out(counts)
+            self._layouts[counts] = _laid_out(counts, self._used)
         return self._layouts[counts]
 
 
@@ -193,31 +203,62 @@ class _Layout:
       chunk: candidates in a chunk.
       row: of the candidate in each place.
       clip: of each chunk.
-      places: of each clip's candidates.
+      place: of each candidate.
+      owner: clip of each candidate.
     """
 
     rows: int
     chunk: int
     row: Int[Array, "places"]
     clip: Int[Array, "chunks"]
-    places: list[slice]
+    place: Int[np.ndarray, "batch"]
+    owner: Int[np.ndarray, "batch"]
 
 
-def _laid_out(counts: tuple[int, ...]) -> _Layout:
+def _laid_out(counts: tuple[int, ...], used: set[tuple[int, int, int]]) -> _Layout:
+    """A layout, of the sizes of one that was used before where it has room and not too much of it; adds to ``used``."""
     total = sum(counts)
-    fitting = (c for c in CHUNKS if sum(-(-count // c) * c for count in counts) <= SPARE * total)
-    chunk = next(fitting, CHUNKS[-1])
-    rows, clip, places, first = [], [], [], 0
+
+    def chunks_of(chunk: int) -> int:
+        return sum(-(-count // chunk) for count in counts)
+
+    before = [u for u in used if chunks_of(u[0]) <= u[1] and u[2] >= total and u[0] * u[1] <= ROOMY * max(total, 64)]
+    if before:
+        chunk, number, rows = min(before, key=lambda u: u[0] * u[1])
+    else:
+        chunk = next((c for c in CHUNKS if chunks_of(c) * c <= SPARE * total), CHUNKS[-1])
+        number, rows = _few(chunks_of(chunk)), 16 * _few(-(-total // 16))
+        used.add((chunk, number, rows))
+    row, clip, place, first = np.zeros(chunk * number, np.int32), np.zeros(number, np.int32), [], 0
+    taken = 0
     for k, count in enumerate(counts):
-        chunks = -(-count // chunk)
-        places.append(slice(len(clip) * chunk, len(clip) * chunk + count))
-        rows.append(first + np.minimum(np.arange(chunks * chunk), max(count - 1, 0)))
-        clip += [k] * chunks
-        first += count
-    spare = _few(len(clip)) - len(clip)
-    rows.append(np.zeros(spare * chunk, np.int64))
-    row = jnp.asarray(np.concatenate(rows).astype(np.int32))
-    return _Layout(16 * _few(-(-total // 16)), chunk, row, jnp.asarray(np.array(clip + [0] * spare, np.int32)), places)
+        own = -(-count // chunk)
+        here = slice(taken * chunk, (taken + own) * chunk)
+        row[here] = first + np.minimum(np.arange(own * chunk), max(count - 1, 0))
+        clip[taken : taken + own] = k
+        place.append(here.start + np.arange(count))
+        first, taken = first + count, taken + own
+    owner = np.repeat(np.arange(len(counts)), counts)
+    return _Layout(rows, chunk, jnp.asarray(row), jnp.asarray(clip), np.concatenate(place), owner)
+
+
+T = TypeVar("T", Sums, Scores)
+
+
+def _by_clip(together: T, counts: Sequence[int]) -> list[T]:
+    """Rows of each clip."""
+    parts = {f.name: _split(getattr(together, f.name), counts) for f in dataclasses.fields(together)}
+    return [type(together)(**{name: part[k] for name, part in parts.items()}) for k in range(len(counts))]
+
+
+def _split(values: np.ndarray, counts: Sequence[int]) -> list[np.ndarray]:
+    return np.split(values, np.cumsum(counts)[:-1])
+
+
+def _marked(scores: Scores, lost: Bool[np.ndarray, "batch"]) -> Scores:
+    """``scores`` with the worst fitness for the candidates that diverged."""
+    fitness, iou = np.where(lost, -np.inf, scores.fitness), np.where(lost, 0.0, scores.iou)
+    return dataclasses.replace(scores, fitness=fitness, iou=iou)
 
 
 def _few(count: int) -> int:
@@ -240,20 +281,15 @@ def _observed(clip: SampledClip, objects: int) -> dict[str, np.ndarray]:
 def _sums(totals: Float[np.ndarray, "sums batch frames"], seen: dict[str, np.ndarray], objects: int) -> Sums:
     intersection, predicted, error, object_error = totals[:4]
     both, drawn = np.moveaxis(totals[4 : 4 + objects], 0, -1), np.moveaxis(totals[4 + objects :], 0, -1)
-    count = totals.shape[1]
-
-    def repeated(name: str) -> np.ndarray:
-        return np.broadcast_to(seen[name], (count, *seen[name].shape))
-
     return Sums(
         intersection=intersection,
-        union=repeated("foreground") + predicted - intersection,
+        union=seen["foreground"] + predicted - intersection,
         object_intersection=both,
-        object_union=repeated("objects") + drawn - both,
+        object_union=seen["objects"] + drawn - both,
         error=error[:, :-1],
-        measured=repeated("measured"),
+        measured=seen["measured"],
         object_error=object_error[:, :-1],
-        object_measured=repeated("object_measured"),
+        object_measured=seen["object_measured"],
     )
 
 
