@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from mjx_refine.diagnosis.fit import SCALE
 from mjx_refine.diagnosis.joint.arrow import Arrow
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.screen import Lead, Screen, distinct
@@ -25,14 +26,15 @@ class JointScreen:
       clips: residuals.
       fit: where to look from.
       views: of each clip, for kinds to propose starts.
+      scale: of the robust loss that the fit was made with [noise widths].
     """
 
-    def __init__(self, clips: Clips, fit: JointFit, views: list[FitView]):
+    def __init__(self, clips: Clips, fit: JointFit, views: list[FitView], scale: float = SCALE):
         self.clips, self.fit, self.views = clips, fit, views
         self.curvature: Arrow = fit.curvature
         self.gradient = fit.gradient
         told = zip(clips.clips, fit.parts, views, strict=True)
-        self.screens = [Screen(clip, part, view) for clip, part, view in told]
+        self.screens = [Screen(clip, part, view, scale) for clip, part, view in told]
 
     def leads(self, names: list[str]) -> list[Lead]:
         """The best few starts of every effect and target, most promising first; their ``shift`` is of joint coordinates."""

@@ -7,17 +7,20 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mjx_refine.diagnosis.fit import Fit
+from mjx_refine.diagnosis.fit import SCALE, Fit
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.screen import JointScreen
 from mjx_refine.diagnosis.joint.slack import set_slackness, with_slackness
 from mjx_refine.diagnosis.screen import Lead
-from mjx_refine.diagnosis.search import DOUBT, SECOND_PROMISE, Told, chosen_of, target_name
+from mjx_refine.diagnosis.search import DOUBT, FORGIVING, SECOND_PROMISE, Told, chosen_of, target_name
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 
 FAMILIES = 6
 """Families (effect and target) that are fitted in full, the most promising first."""
+
+FRESH = 4
+"""Ditto that are fitted from the given scenes as well."""
 
 RIVALS = 3
 """Runners-up that are fitted again from where the best effect's fit ended."""
@@ -131,6 +134,12 @@ def _singles(
         for lead in chosen_of(_look(clips, base, seen, names), FAMILIES if again == 0 else 2):
             told(f"{lead.name} {target_name(seen.names, lead.target)}".strip())
             _fit_lead(clips, base, lead, fitted)
+        if again == 0:
+            # The base model's fit has bent its parameters towards the effect; from the given scenes the way is straight.
+            given = clips.at(base.hypothesis, 0 * base.z, scale=FORGIVING)
+            for lead in chosen_of(_look(clips, given, seen, names, FORGIVING), FRESH, 1):
+                told(f"{lead.name} {target_name(seen.names, lead.target)}, from the given scenes".strip())
+                _fit_lead(clips, given, lead, fitted)
         best = max(fitted.values(), key=lambda fit: fit.evidence, default=base)
         if not fitted:
             break
@@ -145,9 +154,9 @@ def _singles(
     return base, tuple(sorted(found, key=lambda c: -c.lead))
 
 
-def _look(clips: Clips, fit: JointFit, seen: Seen, names) -> list[Lead]:
+def _look(clips: Clips, fit: JointFit, seen: Seen, names, scale: float = SCALE) -> list[Lead]:
     views = [seen.views(c, part) for c, part in enumerate(fit.parts)]
-    return JointScreen(clips, fit, views).leads(names)
+    return JointScreen(clips, fit, views, scale).leads(names)
 
 
 def _lead(fit: JointFit, base: JointFit) -> float:
@@ -159,8 +168,12 @@ def _fit_lead(clips: Clips, here: JointFit, lead: Lead, fitted: dict) -> None:
     """Fits a lead from where it was seen, and keeps it where it is the family's best."""
     one = lead.term(clips.frames)
     hypothesis = here.hypothesis.added(one)
-    fit = clips.fit(hypothesis, _begin(clips, hypothesis, here, lead, lead.z(one)), 9)
-    if fit.cost > here.cost:
+    z = _begin(clips, hypothesis, here, lead, lead.z(one))
+    given = not here.z.any()
+    if given:
+        z = clips.fit(hypothesis, z, 7, scale=FORGIVING).z
+    fit = clips.fit(hypothesis, z, 9)
+    if fit.cost > here.cost and not given:
         # Where the linear look misleads, the effect grows from nothing.
         fit = clips.fit(hypothesis, hypothesis.grown(here.z, 0 * lead.z(one)), 9)
     key = (lead.name, lead.target)
