@@ -2,19 +2,24 @@
 
     MUJOCO_GL=egl python -m benchmarks.speed [--budget 128x100] [--size 480x320] [--frames 30] [--kinds sphere,...]
         [--generations N] [--peer-evaluations 4] [--clips 1,4,16] [--clip-budget 128x100] [--workers N] [--json speed.json]
+        [--together 1,4,16,64] [--populations 32,128,512,2048] [--objects 1,2,4,6] [--sizes 120x80,480x320,1280x720]
+        [--second] [--gpu-peers b,c] [--roofline]
 
 Physics, pictures and search are parts of the population search's generations; compilation is what its first costs more,
 with JAX's cache on disk switched off. ``--generations`` runs fewer than the budget; the whole budget's time is then
 called extrapolated. The peer is pycma with `mujoco.rollout` on two threads and MuJoCo's renderer for segmentation, by
 evaluation; its time for the budget is always extrapolated. ``--clips`` runs `refine_many` on clips of our own, whole
 refinements (landing, search, intervals, report) at ``--clip-budget``, kinds in turn, programs cached by a clip of each
-kind before. Nothing is left out for a load of others: the load is printed.
+kind before; ``--clip-optimizer``, ``--clip-backend`` and ``--clip-refits`` say how. ``--together`` times generations of so
+many clips in lock-step with the last of ``--backends``, ``--gpu-peers`` MJX-Warp's own renderer (b) and plain MJX (c).
+Nothing is left out for a load of others: the load is printed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import platform
 import sys
@@ -29,7 +34,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from benchmarks.raster import machine, renderer_problem
 from benchmarks.speed_parts import Clip, generations, peer, update_times
 from benchmarks.speed_scenes import KINDS, make_clip, timed
+from benchmarks.speed_tables import (
+    gpu_peers_table,
+    pictures_table,
+    population_table,
+    roofline_table,
+    second_process_table,
+    together_table,
+)
 from mjx_refine import Job, Options, refine_many
+from mjx_refine.children import cores
 from mjx_refine.files import write_text
 
 PACKAGES = ("mujoco", "mujoco-mjx", "jax", "numpy", "cma")
@@ -87,12 +101,20 @@ def peer_table(arguments: argparse.Namespace, ours: dict) -> None:
 def clips_table(arguments: argparse.Namespace) -> None:
     """Prints a row for each number of clips through ``refine_many``."""
     population, iterations = arguments.clip_budget
-    options = Options(population=population, iterations=iterations)
+    options = Options(
+        population=population,
+        iterations=iterations,
+        optimizer=arguments.clip_optimizer,
+        backend=arguments.clip_backend,
+        refits=arguments.clip_refits,
+    )
     names = list(arguments.kinds)
     with tempfile.TemporaryDirectory() as temporary:
         folder, most = Path(temporary), max(arguments.clips)
-        clips = [make_clip(folder / f"clip_{i:02d}", names[i % len(names)], i + 1, arguments.size, arguments.frames)
-                 for i in range(most)]  # fmt: skip
+        wanted = [(folder / f"clip_{i:02d}", names[i % len(names)], i + 1, arguments.size, arguments.frames)
+                  for i in range(most)]  # fmt: skip
+        with multiprocessing.get_context("spawn").Pool(min(most, cores())) as pool:
+            clips = pool.starmap(make_clip, wanted, chunksize=1)
         jobs = [Job(clip / "best32.yaml", clip / "flows.npz") for clip in clips]
         os.environ["MJX_REFINE_CACHE"] = str(folder / "cache")
         seconds = timed(
@@ -117,6 +139,25 @@ def clips_table(arguments: argparse.Namespace) -> None:
                   f"| {own:.1f} | {before:.3f}, {after:.3f} |", flush=True)  # fmt: skip
 
 
+def device_tables(arguments: argparse.Namespace) -> None:
+    """Prints the tables that were asked for."""
+    population, count, size = arguments.budget[0], min(arguments.generations or 5, 5), arguments.size
+    backend = arguments.backends[-1] or "auto"
+    if arguments.second:
+        os.environ["MJX_REFINE_CACHE"] = tempfile.gettempdir() + "/mjx-refine-speed"
+        second_process_table(arguments.kinds, [backend], size)
+    if arguments.together:
+        together_table(arguments.kinds, backend, arguments.together, population, count, size)
+    if arguments.populations:
+        population_table(arguments.kinds[-1], backend, arguments.populations, count, size)
+    if arguments.objects:
+        pictures_table(arguments.objects, arguments.sizes, population, count)
+    if arguments.roofline:
+        roofline_table(arguments.kinds, population, count)
+    if arguments.gpu_peers:
+        gpu_peers_table(arguments.gpu_peers, arguments.kinds, population, count, size)
+
+
 def _x(pair: tuple[int, int]) -> str:
     return f"{pair[0]}x{pair[1]}"
 
@@ -138,7 +179,18 @@ def main() -> None:
     parser.add_argument("--peer-evaluations", type=int, default=4, help="a generation; 0: no peer")
     parser.add_argument("--clips", type=lambda text: [int(n) for n in text.split(",") if n], default=[1, 4, 16])
     parser.add_argument("--clip-budget", type=_pair, default=(128, 100))
+    parser.add_argument("--clip-optimizer", default="hybrid")
+    parser.add_argument("--clip-backend", default="auto")
+    parser.add_argument("--clip-refits", type=int, default=6)
     parser.add_argument("--workers", type=int)
+    for name in ("--together", "--populations", "--objects"):
+        parser.add_argument(name, type=lambda text: [int(n) for n in text.split(",")], default=[])
+    parser.add_argument(
+        "--sizes", type=lambda text: [_pair(p) for p in text.split(",")], default=[(120, 80), (480, 320)]
+    )
+    parser.add_argument("--second", action="store_true")
+    parser.add_argument("--gpu-peers", type=lambda text: text.split(","), default=[])
+    parser.add_argument("--roofline", action="store_true")
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()
     os.environ["MJX_REFINE_CACHE"] = "off"
@@ -150,6 +202,7 @@ def main() -> None:
     rows = parts_table(arguments) if arguments.backends != [""] else {}
     if arguments.peer_evaluations:
         peer_table(arguments, rows)
+    device_tables(arguments)
     if arguments.clips:
         clips_table(arguments)
     print(f"\nload at the end {os.getloadavg()[0]:.1f}")

@@ -94,8 +94,8 @@ def together(
     )
 
 
-def pictures(objects: int, size: tuple[int, int], population: int, count: int, frames: int = 30) -> tuple[Times, dict]:
-    """Pictures of a generation at full resolution, and what XLA says of the kernel: flops, bytes accessed."""
+def pictures(objects: int, size: tuple[int, int], population: int, count: int, frames: int = 30) -> Times:
+    """Pictures of a generation, every pixel compared."""
     scene = dataclasses.replace(SIX, objects=SIX.objects[:objects])
     observation = simulate(scene, size=size, frames=frames)
     space = Space.around(near(scene, 1))
@@ -105,7 +105,7 @@ def pictures(objects: int, size: tuple[int, int], population: int, count: int, f
     scorer = GridScorer(scene.shapes, [sampled(observation, tuple(range(1, objects + 1)))])
     scorer.score(poses, batch, [population])
     seconds = [timed(lambda: scorer.score(poses, batch, [population])) for _ in range(count)]
-    return Times(tuple(seconds)), {"samples": population * frames * size[0] * size[1]}
+    return Times(tuple(seconds))
 
 
 FIRST = """

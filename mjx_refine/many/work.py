@@ -155,7 +155,8 @@ def _prepared(job: Job, folder: Path, options: Options, told: Callable[[float], 
         _KEPT.pop(next(iter(_KEPT)))
     _KEPT[opened.digest] = problem
     if ready is None:
-        return _ended(job, folder, options, opened, told)
+        here = dataclasses.replace(opened, resume=(folder / CHECKPOINT).exists())
+        return _ended(job, folder, options, here, told)
     return Prepared(job.name, ready, opened.digest)
 
 

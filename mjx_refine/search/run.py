@@ -117,7 +117,6 @@ class Run:
         if self.options.optimizer != "cmaes":
             self._land()
         start, space, mean, covariance = self._beginning()
-        derivatives = self.choice.final(start, space, mean)
         where, elites = Searched("Least squares converged.", "mujoco", "cpu", 0.0), [mean]
         if self._searched is not None:
             where = self._searched
@@ -132,6 +131,7 @@ class Run:
                 search = self._search(self._objective(start, space, simulator), mean, covariance)
             where = Searched(str(search.reason), simulator.name, simulator.device, time.monotonic() - began)
             elites += search.found
+        derivatives = self.choice.final(start, space, mean)
         return Found(
             **self._finish(start, space, elites, self._objective(start, space)),
             derivatives=derivatives,
@@ -225,7 +225,8 @@ class Run:
     # Search -------------------------------------------------------------------------------------------------------
 
     def ready(self) -> Ready | None:
-        """Lands, and says what the population search needs, for a search elsewhere; None where none is left to do.
+        """Lands, and says what the population search needs, for a search elsewhere; None where none is left to do, or where
+        effects must be searched here.
 
         The checkpoint is then written, to which a search elsewhere adds (``Ready.checkpoint``), and from which a resumed run
         goes on to the finish.
@@ -235,10 +236,9 @@ class Run:
         if self.options.optimizer != "cmaes":
             self._land()
         start, space, mean, covariance = self._beginning()
-        batch = batch_with_effects([start.scene])
-        if batch.effects:
-            return None
         self._save(force=True)
+        if batch_with_effects([start.scene]).effects:
+            return None
         return Ready(
             shapes=start.scene.shapes,
             fps=self.problem.observation.fps,

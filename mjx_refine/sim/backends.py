@@ -63,12 +63,16 @@ def resolve_backend(name: str) -> str:
 
 
 def fastest(name: str, candidates: int) -> str:
-    """The backend that ``name`` means for so many candidates at once: ``auto`` is mujoco also for few.
+    """The backend that ``name`` means here for so many candidates at once: ``auto`` is mujoco also for few.
+
+    In a process beside the one that has the GPU, warp is mujoco.
 
     Raises:
       InputError: no such backend, or warp where it cannot run.
     """
     resolved = resolve_backend(name)
+    if resolved == "warp" == os.environ.get(OFFERED):
+        return "mujoco"
     return "mujoco" if name == "auto" and candidates <= FEW_A_CORE * cores() else resolved
 
 

@@ -8,19 +8,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from own_clip import FLIGHT, perturbed
+from mjx_fitness import Weights
+from own_clip import FLIGHT, SLIDE, perturbed
 
 from mjx_refine.batch import batch_from_scenes
 from mjx_refine.many import Job, refine_many
 from mjx_refine.many.work import RESULTS, Prepared, prepare, work
 from mjx_refine.observation import load_observation, save_observation
-from mjx_refine.scene import Scene, load_scenes, save_scenes
+from mjx_refine.scene import Effect, Scene, load_scenes, save_scenes
 from mjx_refine.search import Options
 from mjx_refine.search.checkpoint import load_checkpoint
 from mjx_refine.search.objective import Objective
 from mjx_refine.search.ready import Searched
 from mjx_refine.search.together import Member, Together
+from mjx_refine.sim import backends
 from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.sim.mjx import room
+from mjx_refine.sim.warp import warp_problem
 from mjx_refine.simulate import simulate
 from mjx_refine.space import Space
 from mjx_refine.view.grid import GridScorer, sampled
@@ -212,3 +216,79 @@ def test_grids_of_different_clips_are_refused(clips):
     batch = batch_from_scenes([FLIGHT] * 4)
     with pytest.raises(ValueError, match="counts add up to 3; expected the batch's 4"):
         scorer.score(np.zeros((4, FRAMES, 1, 7)), batch, [3])  # type: ignore[arg-type]
+
+
+def test_clips_that_leave_keep_their_room(clips):
+    observations = [load_observation(clip / "flows.npz") for clip in clips]
+    scorer = GridScorer(("sphere",), [sampled(one, (1,), (48, 32)) for one in observations])
+    batch = batch_from_scenes([perturbed(FLIGHT, k, 0.2) for k in range(120)])
+    poses = MujocoSimulator(("sphere",), 30.0, 1).rollout(batch, FRAMES)
+    all_three = scorer.score(poses, batch, [40, 40, 40])
+    used = set(scorer._used)
+    left = np.r_[0:40, 80:120]
+    two = scorer.score(poses[left], batch[left], [40, 0, 40])
+    assert scorer._used == used  # nothing is compiled anew
+    assert [len(one.fitness) for one in two] == [40, 0, 40]
+    for k in (0, 2):
+        np.testing.assert_array_equal(two[k].fitness, all_three[k].fitness)
+    scorer.score(poses[:5], batch[:5], [5, 0, 0])
+    assert len(scorer._used) == 2
+
+
+def test_weights_are_each_clips_own(clips):
+    observation = load_observation(clips[0] / "flows.npz")
+    clip = sampled(observation, (1,), (48, 32))
+    batch = batch_from_scenes([perturbed(FLIGHT, k, 0.2) for k in range(6)])
+    poses = MujocoSimulator(("sphere",), 30.0, 1).rollout(batch, FRAMES)
+    weights = (Weights(), Weights(epe=0.0))
+    first, second = GridScorer(("sphere",), [clip, clip], weights).score(poses, batch, [3, 3])
+    np.testing.assert_allclose(first.fitness, first.iou - first.epe)
+    np.testing.assert_allclose(second.fitness, second.iou)
+
+
+def test_batches_take_a_size_that_is_compiled():
+    assert room(100, []) == 128
+    assert room(100, [4096, 256, 300]) == 256
+    assert room(100, [64, 4096]) == 128
+    assert room(100, [], 3) == 129
+
+
+def test_few_candidates_are_for_the_cores(monkeypatch):
+    monkeypatch.setattr(backends, "resolve_backend", lambda name: "warp" if name == "auto" else name)
+    monkeypatch.setattr(backends, "cores", lambda: 16)
+    assert [backends.fastest("auto", n) for n in (128, 384, 385)] == ["mujoco", "mujoco", "warp"]
+    assert backends.fastest("warp", 1) == "warp"
+    assert backends.fastest("mjx", 1) == "mjx"
+    monkeypatch.setenv(backends.OFFERED, "warp")  # what a worker beside the GPU's process has
+    assert backends.fastest("auto", 385) == "mujoco"
+
+
+def test_a_scene_with_an_effect_is_refined_by_its_worker_alone(clips, tmp_path):
+    scene = dataclasses.replace(
+        load_scenes(clips[0] / "best32.yaml")[0], effects=(Effect("slope", None, (("x", 0.02),)),)
+    )
+    save_scenes(tmp_path / "slope.yaml", [scene])
+    job = Job(tmp_path / "slope.yaml", clips[0] / "flows.npz", "slope")
+    outcome = prepare(job, tmp_path, dataclasses.replace(TINY, optimizer="cmaes", iterations=2))
+    assert not isinstance(outcome, Prepared)
+    assert (outcome.status, outcome.evaluations) == ("done", 16)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(warp_problem() is not None, reason="no NVIDIA GPU with Warp")
+def test_clips_are_searched_together_on_a_gpu(clips, tmp_path):
+    """Two groups side by side, and costs near those of C MuJoCo where nothing is chaotic yet."""
+    options = dataclasses.replace(TINY, optimizer="cmaes", backend="warp", population=16)
+    members = members_of(clips, tmp_path, options)
+    calls = [recorded(member) for member in members]
+    simulator = backends.make_simulator("warp", ("sphere",), 30.0, quick=True)
+    Together(members, simulator, lambda member, error: pytest.fail(str(error)) if error else None).run()
+    for member, clip, own in zip(members, clips, calls, strict=True):
+        points, costs = own[0]
+        np.testing.assert_allclose(costs, objective_alone(member, clip)(points)[0], atol=0.02)
+    crate = tmp_path / "crate"
+    crate.mkdir()
+    save_observation(crate / "flows.npz", simulate(SLIDE, size=SIZE, frames=FRAMES))
+    save_scenes(crate / "best32.yaml", [perturbed(SLIDE, 5)])
+    many = refine_many(jobs_of([*clips, crate]), options, out=tmp_path / "out", workers=2)
+    assert [outcome.status for outcome in many.outcomes] == ["done"] * 4
