@@ -54,7 +54,7 @@ def diagnose_recordings(
     Args:
       scenes: one a recording, or one for all; of what they share the medians count.
       poses: the recordings; each has a start of its own. About half are fitted, the others judged.
-      without: effects to leave out of the catalogue; those of camera and picture always are.
+      without: effects to leave out of the catalogue; those of camera and picture, and those that happen once, always are.
       seed: of everything random, also of which recordings are judged.
       threads: of the simulator; all cores by default.
       told: called with a line for each step.

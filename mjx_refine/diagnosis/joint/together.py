@@ -19,14 +19,13 @@ from mjx_refine.diagnosis.joint.slack import GRID
 from mjx_refine.diagnosis.result import ClipGap, Diagnosis, Gap, Place, PoseErrors
 from mjx_refine.diagnosis.verdict import LITTLE
 from mjx_refine.diagnosis.where import places_of
-from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Scene
 from mjx_refine.space import Space
 
-SERIES = tuple(name for name, kind in catalogue().items() if any(p.length < 0 for p in kind.parameters))
-"""Effects with a number for every frame: no two clips share those."""
+PASSING = ("push", "dropped_frames", "camera_shake")
+"""Effects that happen once: they belong to a clip and not to a set-up, and come at another moment in every clip."""
 
 
 class SetUp(abc.ABC):
@@ -161,7 +160,7 @@ def run(
         return _begin(set_up, fitted, clips, hypothesis, seed, told)
 
     seen = Seen(lambda c, part: set_up.view(fitted[c], part), names)
-    compared = compare_together(clips, begin, seen, (*without, *SERIES), seed, told)
+    compared = compare_together(clips, begin, seen, (*without, *PASSING), seed, told)
     outside = _outside(set_up, compared, judged, seed, told)
     answer = said(clips, compared, outside, set_up.least, seed)
     judging = next(o for c, o in outside if answer.shown is None or c is answer.shown)
@@ -303,8 +302,9 @@ def _described(course: Course, fit: JointFit) -> str:
 def _notes(course: Course) -> list[str]:
     compared, told = course.compared, course.told
     notes = [
+        f"{', '.join(PASSING)} were left out: what happens once belongs to a clip, not to a set-up.",
         f"{len(course.fitted)} clips were fitted, {len(course.judged)} judged, chosen by the seed; maps and plots are of "
-        f"{course.set_up.names[0]}."
+        f"{course.set_up.names[0]}.",
     ]
     if compared.impacts:
         notes.append(

@@ -15,7 +15,6 @@ from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.joint.heldout import EARLY, Foretold
 from mjx_refine.diagnosis.joint.hypothesis import common_scenes
 from mjx_refine.diagnosis.joint.together import (
-    SERIES,
     Course,
     SetUp,
     check_once,
@@ -55,7 +54,7 @@ def diagnose_clips(
       scenes: one a clip, refined, without effects; of sizes, masses, contacts, camera and gravity, which the clips share,
         the medians count.
       observations: the clips. About half are fitted, the others judged; the first is always fitted.
-      without: effects to leave out of the catalogue; ``camera_shake``, which differs from clip to clip, always is.
+      without: effects to leave out of the catalogue; those that happen once (``PASSING``) always are.
       seed: of everything random, also of which clips are judged.
       threads: of the simulator; all cores by default.
       told: called with a line for each step.
@@ -154,7 +153,7 @@ def _scores(set_up: Videos, judged: Sequence[int], told: Sequence[Foretold]) -> 
 
 
 def _notes(set_up: Videos) -> list[str]:
-    notes = [UNCALIBRATED, f"{', '.join(SERIES)} was left out: no two clips share it."]
+    notes = [UNCALIBRATED]
     for name, matching in zip(set_up.names, set_up.matchings, strict=True):
         lost = [n for n, i in zip(set_up.problems[0].starts[0].scene.names, matching, strict=True) if i < 0]
         if lost:
