@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import sys
 import threading
@@ -74,6 +75,8 @@ class Batched:
         self.home: dict[str, Worker] = {}
         self.ended: SimpleQueue[tuple[str, Exception | None]] = SimpleQueue()
         self.bell, self._ring = connection.Pipe(duplex=False)
+        # Groups of the same shapes share compiled programs.
+        self._simulator = functools.cache(functools.partial(make_simulator, quick=True))
         self.stop, self.false_starts, self.left = False, 0, len(self.jobs)
 
     def outcomes(self) -> Generator[Outcome]:
@@ -219,7 +222,7 @@ class Batched:
             log.info("%d clips of %s are searched together by %s", len(ready), "+".join(first.shapes), backend)
             if ready:
                 with DEVICE:
-                    simulator = make_simulator(backend, first.shapes, first.fps, quick=True)
+                    simulator = self._simulator(backend, first.shapes, first.fps)
                 Together(ready, simulator, ended, going).run()
         except _Stopped:
             return

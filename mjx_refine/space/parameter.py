@@ -49,6 +49,11 @@ class Parameter:
         return value if self.offset is None else math.log(value + self.offset)
 
     @property
+    def transformed_low(self) -> float:
+        """The lower bound on the transformed scale."""
+        return self._transform(self.low)
+
+    @property
     def span(self) -> float:
         """Distance of the bounds on the transformed scale."""
         return self._transform(self.high) - self._transform(self.low)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -112,12 +113,27 @@ class Space:
         count = len(u)
         base = batch_from_scenes([self.scene]).map(lambda a: np.repeat(a, count, 0))
         raw = self._intermediate(base)
-        columns = [(p, p.from_unit(u[:, j])) for j, p in enumerate(self.parameters)]
+        columns = zip(self.parameters, self._from_unit(u).T, strict=True)
         for parameter, value in (*self.held, *columns):
             i, k = parameter.index
             target = raw[parameter.field]
             target[(slice(None), k) if i < 0 else (slice(None), i, k)] = value
         return with_effects(self._assemble(base, raw), self.scene)
+
+    def _from_unit(self, u: Float[np.ndarray, "batch dimension"]) -> Float[np.ndarray, "batch dimension"]:
+        """Every parameter's ``from_unit``, all at once."""
+        low, span, offset, least, most = self._scales
+        values = low + u * span
+        logarithmic = np.isfinite(offset)
+        values[:, logarithmic] = np.exp(values[:, logarithmic]) - offset[logarithmic]
+        return np.clip(values, least, most)
+
+    @functools.cached_property
+    def _scales(self) -> Float[np.ndarray, "5 dimension"]:
+        """Low end and span on the transformed scale, offset (NaN where linear), bounds."""
+        offsets = [np.nan if p.offset is None else p.offset for p in self.parameters]
+        rows = [(p.transformed_low, p.span, o, p.low, p.high) for p, o in zip(self.parameters, offsets, strict=True)]
+        return np.array(rows, np.float64).reshape(-1, 5).T
 
     def _intermediate(self, base: SceneBatch) -> dict[str, np.ndarray]:
         count, objects = base.mass.shape

@@ -297,6 +297,13 @@ def test_freezing_twice_is_freezing_both():
     assert [reason for _, reason in twice.fixed].count("first") == first.sum()
 
 
+def test_decoding_gives_each_parameter_its_own_value_to_the_bit():
+    space = Space.around(Scene((body("box"), dataclasses.replace(body("cylinder"), name="other")), CAMERA))
+    u = np.random.default_rng(0).random((37, space.dimension))
+    columns = [parameter.from_unit(u[:, j]) for j, parameter in enumerate(space.parameters)]
+    np.testing.assert_array_equal(space._from_unit(u), np.stack(columns, 1))
+
+
 # Errors -----------------------------------------------------------------------------------------------------------------
 
 
