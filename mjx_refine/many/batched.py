@@ -18,11 +18,13 @@ from mjx_refine.many.groups import Kind
 from mjx_refine.many.jobs import Job
 from mjx_refine.many.outcome import FAILED, Outcome
 from mjx_refine.many.progress import ManyProgress
+from mjx_refine.many.warm import warm_up
 from mjx_refine.many.work import SEARCHING, Prepared, told_of
 from mjx_refine.many.worker import MOST_FALSE_STARTS, UNGUARDED, Worker
 from mjx_refine.search import Options
 from mjx_refine.search.together import CANDIDATES, DEVICE, Member, Together
 from mjx_refine.sim.backends import fastest, make_simulator
+from mjx_refine.sim.devices import has_accelerator
 
 log = logging.getLogger("mjx_refine")
 
@@ -86,7 +88,10 @@ class Batched:
           RuntimeError: workers end before they begin.
         """
         interval = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH)
         enable_cache()
+        if has_accelerator():
+            threading.Thread(target=self._warm_up, daemon=True).start()
         try:
             while self.left:
                 self._hire()
@@ -191,9 +196,15 @@ class Batched:
         self.searching = [thread for thread in self.searching if thread.is_alive()]
         while self.to_search and len(self.searching) < AT_ONCE:
             thread = threading.Thread(target=self._search_group, args=(self.to_search.popleft(),), daemon=True)
-            sys.setswitchinterval(SWITCH)
             self.searching.append(thread)
             thread.start()
+
+    def _warm_up(self) -> None:
+        """Compiles a group's programs while its clips land, group by group."""
+        for kind in list(self.landed):
+            names = [name for name in self.jobs if self.kinds[name] == kind]
+            if not self.stop and self.unlanded[kind]:
+                warm_up(self.jobs[names[0]], len(names), self.options, self._simulator)
 
     def _search_group(self, group: list[Prepared]) -> None:
         members: dict[int, str] = {}

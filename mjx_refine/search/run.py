@@ -17,6 +17,7 @@ from mjx_refine.search.intervals import Intervals, intervals
 from mjx_refine.search.landed import LANDED_WELL, Landed, first_covariance, landed_well
 from mjx_refine.search.landing import LeastSquares
 from mjx_refine.search.objective import Objective
+from mjx_refine.search.options import Options
 from mjx_refine.search.population import PopulationSearch
 from mjx_refine.search.problem import Problem, Start, kind_of_scene
 from mjx_refine.search.progress import Progress, Step
@@ -108,9 +109,7 @@ class Run:
     @property
     def resolution(self) -> tuple[int, int]:
         """(width, height) of the search's samples."""
-        width, height = self.problem.observation.size
-        wanted = self.options.resolution or (SEARCH_WIDTH, round(SEARCH_WIDTH * height / width))
-        return min(width, wanted[0]), min(height, max(wanted[1], 8))
+        return search_resolution(self.options, self.problem.observation.size)
 
     def __call__(self) -> Found:
         """Runs to the end."""
@@ -371,3 +370,10 @@ class Run:
         if values.get("searched") is not None:
             self._searched = Searched(*values["searched"])
         self.progress.message(f"resumed after {self.evaluations} rollouts")
+
+
+def search_resolution(options: Options, size: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) of the samples at which a search compares pictures of ``size``."""
+    width, height = size
+    wanted = options.resolution or (SEARCH_WIDTH, round(SEARCH_WIDTH * height / width))
+    return min(width, wanted[0]), min(height, max(wanted[1], 8))

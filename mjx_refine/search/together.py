@@ -204,7 +204,8 @@ class Together:
         with DEVICE:
             poses = launched(self.simulator, batch, self.scorer.length)
             prices = price_of_overlap(self.reference, batch)  # while the device computes
-            scores = self.scorer.score(poses, batch, counts)
+            sums = self.scorer.compared(poses, batch, counts)
+        scores = self.scorer.scored(sums, counts)
         own = np.split(prices, np.cumsum(counts)[:-1])
         rows = [self.rows[id(member)] for member, _, _ in part]
         return [(own[row] - scores[row].fitness, scores[row]) for row in rows]

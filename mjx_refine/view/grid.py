@@ -33,6 +33,9 @@ SPARE = 1.1
 ROOMY = 2.0
 """While clips leave, their room is kept up to this factor: what is compiled fits on."""
 
+_USED: dict[tuple, set[tuple[int, int, int]]] = {}
+"""Sizes of layouts (candidates in a chunk, chunks, rows of poses) that programs are compiled for, by what else they depend on."""
+
 AWAY = (0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0)
 """The pose of what is not to be seen."""
 
@@ -143,7 +146,7 @@ class GridScorer:
             **{name: jnp.asarray(np.stack([getattr(c, name) for c in kept])) for name in ("ids", "flow_x", "flow_y")},
         )
         self._layouts: dict[tuple[int, ...], _Layout] = {}
-        self._used: set[tuple[int, int, int]] = set()
+        self._used = _USED.setdefault((shapes, self.image, self.moving_only, self._clips.ids.shape), set())
         observed = [_observed(clip, len(shapes)) for clip in clips]
         self._observed = {name: np.stack([one[name] for one in observed]) for name in observed[0]}
 
@@ -154,7 +157,13 @@ class GridScorer:
     def score(
         self, poses: Float[Array | np.ndarray, "rows frames objects 7"], batch: SceneBatch, counts: Sequence[int]
     ) -> list[Scores]:
-        """Scores of every clip's candidates.
+        """Scores of every clip's candidates: ``compared``, then ``scored``."""
+        return self.scored(self.compared(poses, batch, counts), counts)
+
+    def compared(
+        self, poses: Float[Array | np.ndarray, "rows frames objects 7"], batch: SceneBatch, counts: Sequence[int]
+    ) -> Float[np.ndarray, "sums places frames"]:
+        """The device's part: sums over samples, for ``scored``.
 
         Args:
           poses: of the candidates of all clips, one clip after the other; there may be further rows.
@@ -170,8 +179,12 @@ class GridScorer:
             poses = np.concatenate([poses, np.zeros((room - len(poses), *poses.shape[1:]), np.float32)])
         shown = jnp.asarray(poses, jnp.float32), jnp.asarray(seen_from)
         static = (self.shapes, self.image, self.moving_only, layout.chunk)
-        totals = np.asarray(_scored(*static, *shown, layout.row, layout.clip, self._clips), np.float64)
-        totals = totals[:, layout.place]
+        return np.asarray(_compared(*static, *shown, layout.row, layout.clip, self._clips))
+
+    def scored(self, totals: Float[np.ndarray, "sums places frames"], counts: Sequence[int]) -> list[Scores]:
+        """Each clip's scores from what ``compared`` returned for these ``counts``."""
+        layout = self._layout(tuple(counts), sum(counts))
+        totals = totals[:, layout.place].astype(np.float64)
         lost = totals[0, :, 0] < 0
         totals = np.where(lost[:, None], -1.0 - totals, totals)
         seen = {name: values[layout.owner] for name, values in self._observed.items()}
@@ -294,7 +307,7 @@ def _sums(totals: Float[np.ndarray, "sums batch frames"], seen: dict[str, np.nda
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
-def _scored(
+def _compared(
     shapes: tuple[Shape, ...],
     image: tuple[int, int],
     moving_only: bool,

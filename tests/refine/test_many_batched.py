@@ -13,6 +13,7 @@ from own_clip import FLIGHT, SLIDE, perturbed
 
 from mjx_refine.batch import batch_from_scenes
 from mjx_refine.many import Job, refine_many
+from mjx_refine.many.warm import warm_up
 from mjx_refine.many.work import RESULTS, Prepared, prepare, work
 from mjx_refine.observation import load_observation, save_observation
 from mjx_refine.scene import Effect, Scene, load_scenes, save_scenes
@@ -27,6 +28,7 @@ from mjx_refine.sim.mjx import room
 from mjx_refine.sim.warp import warp_problem
 from mjx_refine.simulate import simulate
 from mjx_refine.space import Space
+from mjx_refine.view import grid
 from mjx_refine.view.grid import GridScorer, sampled
 from mjx_refine.view.tiles import TileScorer
 
@@ -224,7 +226,7 @@ def test_clips_that_leave_keep_their_room(clips):
     batch = batch_from_scenes([perturbed(FLIGHT, k, 0.2) for k in range(120)])
     poses = MujocoSimulator(("sphere",), 30.0, 1).rollout(batch, FRAMES)
     all_three = scorer.score(poses, batch, [40, 40, 40])
-    used = set(scorer._used)
+    used = set(scorer._used)  # also those of other scorers of the kind
     left = np.r_[0:40, 80:120]
     two = scorer.score(poses[left], batch[left], [40, 0, 40])
     assert scorer._used == used  # nothing is compiled anew
@@ -232,7 +234,28 @@ def test_clips_that_leave_keep_their_room(clips):
     for k in (0, 2):
         np.testing.assert_array_equal(two[k].fitness, all_three[k].fitness)
     scorer.score(poses[:5], batch[:5], [5, 0, 0])
-    assert len(scorer._used) == 2
+    assert len(scorer._used) == len(used) + 1
+
+
+def test_what_is_compiled_beforehand_is_what_the_clips_then_run(clips, tmp_path):
+    options = dataclasses.replace(TINY, optimizer="cmaes", population=12)
+    simulator = MujocoSimulator(("sphere",), 30.0, 1)
+    asked = []
+
+    def made(backend, shapes, fps):
+        asked.append((backend, shapes, fps))
+        return simulator
+
+    warm_up(jobs_of(clips)[0], 3, options, made)
+    assert asked == [("mujoco", ("sphere",), 30.0)]
+    compiled = grid._compared._cache_size()
+    assert compiled > 0
+    ended = []
+    Together(members_of(clips, tmp_path, options), simulator, lambda member, error: ended.append(error)).run()
+    assert ended == [None] * 3
+    assert grid._compared._cache_size() == compiled
+    warm_up(Job(tmp_path / "none.yaml", tmp_path / "none.npz", "none"), 3, options, made)  # its worker will say so
+    assert len(asked) == 1
 
 
 def test_weights_are_each_clips_own(clips):
