@@ -10,7 +10,7 @@ from own_clip import CAMERA, SIZE
 
 from mjx_refine.diagnosis import diagnose
 from mjx_refine.diagnosis.diagnose import chance
-from mjx_refine.diagnosis.fit import TAIL, prior
+from mjx_refine.diagnosis.fitted import TAIL, prior
 from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.slack import impacts, slack_of, spins
