@@ -77,6 +77,7 @@ class Batched:
         self.home: dict[str, Worker] = {}
         self.ended: SimpleQueue[tuple[str, Exception | None]] = SimpleQueue()
         self.bell, self._ring = connection.Pipe(duplex=False)
+        self._telling = threading.Lock()
         # Groups of the same shapes share compiled programs.
         self._simulator = functools.cache(functools.partial(make_simulator, quick=True))
         self.stop, self.false_starts, self.left = False, 0, len(self.jobs)
@@ -242,8 +243,9 @@ class Batched:
                 self._tell(name, error)
 
     def _tell(self, name: str, error: Exception | None) -> None:
-        self.ended.put((name, error))
-        self._ring.send_bytes(b".")
+        with self._telling:  # several groups may end at once
+            self.ended.put((name, error))
+            self._ring.send_bytes(b".")
 
     def _searched(self) -> Outcome | None:
         """A search has ended: its clip is to be finished, or has failed."""
