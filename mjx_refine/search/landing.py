@@ -9,7 +9,6 @@ means anything.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -17,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.batch import SceneBatch
+from mjx_refine.search.course import Course, Landing
 from mjx_refine.search.features import DIRECTIONS, POINTS, Outlines
 from mjx_refine.search.schedule import Stage
 from mjx_refine.space import Space
@@ -56,24 +56,8 @@ EDGE_WEIGHT = float(np.sqrt(6 / DIRECTIONS)) / NOISE_FLOOR
 MOTION_WEIGHT = float(np.sqrt(2 / POINTS)) / FLOW_NOISE
 """Of one direction of an outline, and of one coordinate of the flow at one point [1 / px at a picture 480 wide]."""
 
-
-@dataclasses.dataclass(frozen=True)
-class Landing:
-    """Where least squares arrived.
-
-    Attributes:
-      point: in the unit box.
-      cost: half the sum of squares at the last stage.
-      covariance: inverse curvature of that cost, the prior included, in the unit box.
-      sensitivity: change of the residual vector [noise widths] for one prior width of each parameter, without the prior.
-      evaluations: rollouts it took, in units of the whole clip.
-    """
-
-    point: Float[np.ndarray, "dimension"]
-    cost: float
-    covariance: Float[np.ndarray, "dimension dimension"]
-    sensitivity: Float[np.ndarray, "dimension"]
-    evaluations: int
+Progress = Callable[[Stage, np.ndarray, float], bool | None]
+"""Is told a stage, where it ended and its cost."""
 
 
 class LeastSquares:
@@ -206,7 +190,7 @@ class LeastSquares:
         start: np.ndarray,
         schedule: list[Stage],
         hops: int = 0,
-        progress: Callable[[Stage, np.ndarray], None] | None = None,
+        progress: Progress | None = None,
     ) -> Landing:
         """Goes through the stages from ``start``.
 
@@ -214,13 +198,48 @@ class LeastSquares:
           start: in the unit box.
           schedule: horizons, in order.
           hops: attempts at each horizon to find a better basin for objects that do not fit.
-          progress: called after each stage.
+          progress: called after each stage; False from it ends the landing there.
         """
+        return self.land(Course(start), schedule, hops, progress)
+
+    def follow(self, course: Course, schedule: list[Stage], until: int) -> Course:
+        """The stages of at most ``until`` frames."""
+        stop = course.stage + sum(stage.frames <= until for stage in schedule[course.stage :])
+        return self._follow(course, schedule, stop)[0]
+
+    def land(
+        self,
+        course: Course,
+        schedule: list[Stage],
+        hops: int = 0,
+        progress: Progress | None = None,
+    ) -> Landing:
+        """The stages that are left, see ``run``."""
         before = self.evaluations
+        course, jacobian = self._follow(course, schedule, len(schedule), hops, progress)
+        point, last = course.point, schedule[-1]
+        if course.cost < np.inf and not len(jacobian) and self.evaluations + len(point) < self.limit:
+            base, _ = self.residuals(point[None], last.frames, last.scale)
+            jacobian = self.jacobian(point, base[0], last.frames, last.scale)
+        curvature = jacobian.T @ jacobian + np.eye(len(point))
+        scale = self.space.sigma
+        return Landing(
+            point=point,
+            cost=course.cost,
+            covariance=np.linalg.inv(curvature) * np.outer(scale, scale),
+            sensitivity=np.linalg.norm(jacobian, axis=0),
+            evaluations=self.evaluations - before,
+        )
+
+    def _follow(
+        self, course: Course, schedule: list[Stage], stop: int, hops: int = 0, progress: Progress | None = None
+    ) -> tuple[Course, np.ndarray]:
+        """Stages up to ``stop``, and the Jacobian where the last of them ended, without rows where none was computed."""
         generator = np.random.default_rng(self.seed)
-        point, jacobian, cost = start, np.zeros((0, len(start))), np.inf
-        known = 0
-        for k, stage in enumerate(schedule):
+        point, cost, known = course.point, course.cost, course.known
+        jacobian = np.zeros((0, len(point)))
+        for k in range(course.stage, stop):
+            stage = schedule[k]
             if self._spent:
                 break
             if EARLY * len(self.target) < stage.frames <= known and stage.frames < len(self.target):
@@ -230,22 +249,11 @@ class LeastSquares:
                 point, cost, jacobian = self._extend(point, jacobian, stage, hops, generator)
             else:
                 point, cost, jacobian = self._stage(point, stage, slopes)
-            if progress:
-                progress(stage, point)
+            if progress and progress(stage, point, cost) is False:
+                break
             if len(schedule) > 1:
                 known = self._fitting(point, stage.frames)
-        if cost < np.inf and not len(jacobian) and self.evaluations + len(start) < self.limit:
-            base, _ = self.residuals(point[None], schedule[-1].frames, schedule[-1].scale)
-            jacobian = self.jacobian(point, base[0], schedule[-1].frames, schedule[-1].scale)
-        curvature = jacobian.T @ jacobian + np.eye(len(start))
-        scale = self.space.sigma
-        return Landing(
-            point=point,
-            cost=cost,
-            covariance=np.linalg.inv(curvature) * np.outer(scale, scale),
-            sensitivity=np.linalg.norm(jacobian, axis=0),
-            evaluations=self.evaluations - before,
-        )
+        return Course(point, cost, known, stop), jacobian
 
     def _extend(self, point, jacobian, stage: Stage, hops: int, generator):
         """Least squares at a longer horizon, from several points that the shorter one leaves open.

@@ -35,6 +35,7 @@ class PopulationSearch:
       start: a point that the first generation contains beside the mean.
       landed: whether the mean is a good landing, around which the width is fitted first.
       evaluations: rollouts spent before.
+      part: of what is left of the budget that the search can count on.
 
     Attributes:
       evaluations: rollouts spent.
@@ -50,6 +51,7 @@ class PopulationSearch:
         start: Float[np.ndarray, "dimension"],
         landed: bool,
         evaluations: int,
+        part: float = 1.0,
     ):
         self.options, self.mean, self.covariance, self.start = options, mean, covariance, start
         self.evaluations = evaluations
@@ -57,7 +59,7 @@ class PopulationSearch:
         self.reason: str | None = None
         self.state: mjx_cmaes.State | None = None
         left = options.budget - evaluations
-        self._population(self._fitting(left))
+        self._population(self._fitting(int(part * left)))
         self._probing = landed and left > PROBING
         self.elites, self._costs = mean[None], np.full(1, np.inf)
         if left < self.population:

@@ -14,17 +14,18 @@ from mjx_refine.scene import Scene
 from mjx_refine.search.checkpoint import damaged, input_digest, load_checkpoint, save_checkpoint
 from mjx_refine.search.derivatives import DerivativeChoice, Derivatives
 from mjx_refine.search.intervals import Intervals, intervals
-from mjx_refine.search.landed import LANDED_WELL, Landed, first_covariance, landed_well
+from mjx_refine.search.landed import Landed, first_covariance, landed_well
 from mjx_refine.search.landing import LeastSquares
+from mjx_refine.search.landings import Landings
 from mjx_refine.search.objective import Objective
 from mjx_refine.search.options import Options
 from mjx_refine.search.population import PopulationSearch
 from mjx_refine.search.problem import Problem, Start, kind_of_scene
 from mjx_refine.search.progress import Progress, Step
+from mjx_refine.search.race import OPEN, TRIAL, Contender, Race, second_landing
 from mjx_refine.search.ready import Ready, Searched
-from mjx_refine.search.schedule import stages
 from mjx_refine.search.undetermined import back_to_start, insensitive
-from mjx_refine.sim.backends import fastest, make_simulator
+from mjx_refine.sim.backends import Simulator, fastest, make_simulator
 from mjx_refine.sim.devices import has_accelerator, on_device
 from mjx_refine.space import Space
 from mjx_refine.view.effects import needs_pictures
@@ -71,6 +72,16 @@ class Found:
     searched: float
 
 
+@dataclasses.dataclass(frozen=True)
+class Beginning:
+    """Where a population search starts: a sample, its space, and the first generation's mean and covariance."""
+
+    start: Start
+    space: Space
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
 class Run:
     """One refinement.
 
@@ -87,12 +98,13 @@ class Run:
         self.began = time.monotonic()
         self.digest = input_digest(problem.samples, problem.observation, self.options)
         self.history: list[Step] = []
-        self.landed: list[Landed] = []
+        share = LANDING_SHARE if self.options.optimizer == "hybrid" else 1.0
+        limit = int(share * self.options.budget)
+        self.landings = Landings(problem, self._automatic_squares, self._shown, limit)
         self.evaluations = 0
         self.before = 0.0
         self._saved: tuple[dict, dict] | None = None
         self._written = 0.0
-        self._planned = 0
         self._searched: Searched | None = None
         if resume and checkpoint is not None:
             loaded = load_checkpoint(checkpoint, self.digest)
@@ -115,22 +127,21 @@ class Run:
         """Runs to the end."""
         if self.options.optimizer != "cmaes":
             self._land()
-        start, space, mean, covariance = self._beginning()
-        where, elites = Searched("Least squares converged.", "mujoco", "cpu", 0.0), [mean]
+        first = self._beginning()
+        winner, where, found = first, Searched("Least squares converged.", "mujoco", "cpu", 0.0), []
         if self._searched is not None:
             where = self._searched
-            elites += self._begun(space, mean, covariance).found
+            found = self._race([first]).contenders[0].search.found
         elif self.options.optimizer != "gradient":
             began = time.monotonic()
-            backend = self.problem.backends[kind_of_scene(start.given)]
-            if backend != "mujoco":
-                backend = fastest(self.options.backend, self.options.population)
             with on_device():
-                simulator = make_simulator(backend, start.scene.shapes, self.problem.observation.fps, quick=True)
-                search = self._search(self._objective(start, space, simulator), mean, covariance)
-            where = Searched(str(search.reason), simulator.name, simulator.device, time.monotonic() - began)
-            elites += search.found
-        derivatives = self.choice.final(start, space, mean)
+                chosen, simulator = self._search(first)
+            winner = Beginning(chosen.start, chosen.space, chosen.search.mean, chosen.search.covariance)
+            where = Searched(str(chosen.search.reason), simulator.name, simulator.device, time.monotonic() - began)
+            found = chosen.search.found
+        start, space = winner.start, winner.space
+        derivatives = self.choice.final(start, space, winner.mean)
+        elites = [winner.mean, *found]
         return Found(
             **self._finish(start, space, elites, self._objective(start, space)),
             derivatives=derivatives,
@@ -155,44 +166,23 @@ class Run:
     # Land ---------------------------------------------------------------------------------------------------------
 
     def _land(self) -> None:
-        """Lands from the best samples; where none lands well, again from the best of them with more attempts at each
-        contact, then from further samples."""
-        share = LANDING_SHARE if self.options.optimizer == "hybrid" else 1.0
-        limit = int(share * self.options.budget)
-        ranks, count = range(len(self.problem.starts)), self.options.starts
-        plan = [(rank, 0) for rank in ranks[:count]] + [(-1, 2)]
-        plan += [(rank, 0) for rank in ranks[count : 3 * count]] + [(-1, 2)]
-        for step, (rank, hops) in enumerate(plan):
-            if step < self._planned:
-                continue
-            done = max((r.iou for r in self.landed), default=0.0)
-            if step >= self.options.starts and done >= LANDED_WELL:
-                break
-            if self.landed and self.evaluations + self.evaluations / len(self.landed) > limit:
-                break
-            if rank < 0:
-                rank = max(self.landed, key=lambda landed: landed.fitness).rank
-            self.landed.append(self._land_one(rank, limit - self.evaluations, hops))
-            self._planned = step + 1
-            self._save(force=True)
+        self.landings(lambda: self._save(force=True))
+        self.evaluations = max(self.evaluations, self.landings.evaluations)
 
-    def _land_one(self, rank: int, limit: int, hops: int) -> Landed:
-        start = self.problem.starts[rank]
-        space = Space.around(start.scene)
-        squares = self._squares(start, space, limit)
+    def _shown(self, evaluations: int, start: Start, space: Space, point: np.ndarray, frames: int) -> None:
+        self.evaluations = evaluations
+        costs, scores = self._objective(start, space)(point[None])
+        self._step("land", (-float(costs[0]), float(scores.iou[0]), float(scores.epe[0])), float(frames))
+
+    @property
+    def landed(self) -> list[Landed]:
+        """Where least squares arrived so far."""
+        return self.landings.landed
+
+    def _automatic_squares(self, start: Start, space: Space) -> LeastSquares:
+        squares = self._squares(start, space)
         squares.automatic = self.choice.automatic(start, space)
-        objective = self._objective(start, space)
-        before = self.evaluations
-
-        def show(stage, point: np.ndarray) -> None:
-            self.evaluations = before + squares.evaluations
-            costs, scores = objective(point[None])
-            self._step("land", (-float(costs[0]), float(scores.iou[0]), float(scores.epe[0])), float(stage.frames))
-
-        landing = squares.run(space.start, stages(self.problem.observation.length), hops, show)
-        self.evaluations = before + landing.evaluations
-        scores = self.problem.score([space.scene_at(landing.point)], start.matching)
-        return Landed(rank, landing.point, landing.covariance, float(scores.fitness[0]), float(scores.iou[0]))
+        return squares
 
     def _squares(self, start: Start, space: Space, limit: int = 10**9) -> LeastSquares:
         reference = self.problem.reference(start.scene.shapes)
@@ -210,16 +200,26 @@ class Run:
             fps=reference.fps,
         )
 
-    def _beginning(self) -> tuple[Start, Space, np.ndarray, np.ndarray]:
+    def _beginning(self) -> Beginning:
         """Where the population search starts: the best landing, or the best sample."""
         if self.landed:
             best = max(self.landed, key=lambda landed: landed.fitness)
             start = self.problem.starts[best.rank]
             space = Space.around(start.scene)
-            return start, space, best.point, first_covariance(best, space)
+            return Beginning(start, space, best.point, first_covariance(best, space))
         start = self.problem.starts[0]
         space = Space.around(start.scene)
-        return start, space, space.start, np.diag(space.sigma**2)
+        return Beginning(start, space, space.start, np.diag(space.sigma**2))
+
+    def _beginnings(self, first: Beginning) -> list[Beginning]:
+        """``first``, and another landing where none is good."""
+        alone = self.options.optimizer != "hybrid" or (self._saved is not None and "searches" not in self._saved[0])
+        other = None if alone else second_landing(self.landed, self.options.budget - self.landings.evaluations)
+        if other is None:
+            return [first]
+        start = self.problem.starts[other.rank]
+        space = Space.around(start.scene)
+        return [first, Beginning(start, space, other.point, np.diag((OPEN * space.sigma) ** 2))]
 
     # Search -------------------------------------------------------------------------------------------------------
 
@@ -234,45 +234,62 @@ class Run:
             return None
         if self.options.optimizer != "cmaes":
             self._land()
-        start, space, mean, covariance = self._beginning()
+        first = self._beginning()
         self._save(force=True)
-        if batch_with_effects([start.scene]).effects:
+        if batch_with_effects([first.start.scene]).effects:
             return None
         return Ready(
-            shapes=start.scene.shapes,
+            shapes=first.start.scene.shapes,
             fps=self.problem.observation.fps,
-            samples=sampled(self.problem.observation, start.matching, self.resolution),
+            samples=sampled(self.problem.observation, first.start.matching, self.resolution),
             options=self.options,
-            space=space,
-            mean=mean,
-            covariance=covariance,
+            space=first.space,
+            mean=first.mean,
+            covariance=first.covariance,
             landed=landed_well(self.landed),
             checkpoint=self.path,
         )
 
-    def _begun(self, space: Space, mean: np.ndarray, covariance: np.ndarray) -> PopulationSearch:
-        """The search, or what is saved of it."""
-        landed = landed_well(self.landed)
-        search = PopulationSearch(self.options, mean, covariance, space.start, landed, self.evaluations)
+    def _race(self, beginnings: list[Beginning]) -> Race:
+        """The search from each, or what is saved of it."""
+        options, before, landed = self.options, self.landings.evaluations, landed_well(self.landed)
+        part = 1.0 - TRIAL * (len(beginnings) - 1)
+        searches = [
+            PopulationSearch(options, b.mean, b.covariance, b.space.start, landed, before, part) for b in beginnings
+        ]
+        contenders = [Contender(b.start, b.space, s) for b, s in zip(beginnings, searches, strict=True)]
+        race = Race(contenders, options, before)
         if self._saved is not None:
             try:
-                search.restore(*self._saved)
+                race.restore(*self._saved)
             except (KeyError, ValueError, TypeError) as error:
                 raise damaged(Path(self.path or ""), error) from error
-        return search
+            race.evaluations = self.evaluations
+        return race
 
-    def _search(self, objective: Objective, mean: np.ndarray, covariance: np.ndarray) -> PopulationSearch:
-        """Generations until the search ends."""
-        search = self._begun(objective.space, mean, covariance)
-        while (points := search.points()) is not None:
-            costs, scores = objective(points)
-            generation = search.told(points, costs, scores)
-            self.evaluations = search.evaluations
+    def _search(self, first: Beginning) -> tuple[Contender, Simulator]:
+        """Generations until the search ends; the search that came highest, and what simulated it."""
+        race = self._race(self._beginnings(first))
+        backend = self.problem.backends[kind_of_scene(first.start.given)]
+        if backend != "mujoco":
+            backend = fastest(self.options.backend, self.options.population)
+        fps, simulators = self.problem.observation.fps, []
+        for contender in race.contenders:
+            simulators.append(make_simulator(backend, contender.space.scene.shapes, fps, quick=True))
+        objectives = [
+            self._objective(c.start, c.space, simulator)
+            for c, simulator in zip(race.contenders, simulators, strict=True)
+        ]
+        while (turn := race.turn()) is not None:
+            k, points = turn
+            costs, scores = objectives[k](points)
+            generation = race.told(k, points, costs, scores)
+            self.evaluations = race.evaluations
             if generation:
-                self._step("search", search.best, search.spread)
-                self._saved = search.saved()
+                self._step("search", race.contenders[race.winner].search.best, race.contenders[k].search.spread)
+                self._saved = race.saved()
                 self._save()
-        return search
+        return race.contenders[race.winner], simulators[race.winner]
 
     # Finish -------------------------------------------------------------------------------------------------------
 
@@ -340,14 +357,11 @@ class Run:
             "evaluations": self.evaluations,
             "seconds": self.seconds,
             "history": [dataclasses.astuple(step) for step in self.history],
-            "planned": self._planned,
-            "landed": [[r.rank, r.fitness, r.iou] for r in self.landed],
             "searching": self._saved is not None,
             "searched": None if self._searched is None else dataclasses.astuple(self._searched),
         }
-        arrays = {}
-        for k, r in enumerate(self.landed):
-            arrays[f"landed.{k}.point"], arrays[f"landed.{k}.covariance"] = r.point, r.covariance
+        landed, arrays = self.landings.saved()
+        values.update(landed)
         if self._saved is not None:
             values.update(self._saved[0])
             arrays.update(self._saved[1])
@@ -360,11 +374,8 @@ class Run:
             return
         values, arrays = loaded
         self.evaluations, self.before = values["evaluations"], values["seconds"]
-        self._planned = values["planned"]
         self.history = [Step(*row) for row in values["history"]]
-        for k, (rank, fitness, iou) in enumerate(values["landed"]):
-            point, covariance = arrays[f"landed.{k}.point"], arrays[f"landed.{k}.covariance"]
-            self.landed.append(Landed(rank, point, covariance, fitness, iou))
+        self.landings.restore(values, arrays)
         if values["searching"]:
             self._saved = (values, arrays)
         if values.get("searched") is not None:

@@ -18,6 +18,10 @@ HORIZONS = (0.1, 0.17, 0.24, 0.32, 0.41, 0.5, 0.6, 0.72, 0.86, 1.0)
 """Parts of the clip, one after the other; small steps at first, while there is little to go by."""
 
 
+HEATS = (0.1, 0.41)
+"""Parts of the clip at which samples that may land are compared."""
+
+
 def stages(length: int) -> list[Stage]:
     """The horizon from the first frame to the whole clip, the loss from forgiving to strict."""
     horizons = sorted({1, *[min(length, max(2, round(length * part))) for part in HORIZONS]})
