@@ -26,6 +26,9 @@ SECOND_HEAT = 8.0
 """What a whole landing and the second heat cost, in multiples of the first heat: medians of clips of one to three
 objects."""
 
+LANDED_WHOLLY = 0.99
+"""IoU of a landing after which no other sample lands: what is left is for the population search."""
+
 HOPELESS = 4.0
 """A sample whose cost in a heat is more than so many times the best one's waits for those that are better; a landing
 whose cost at a horizon is, is broken off."""
@@ -81,7 +84,7 @@ class Landings:
             if step < self._planned:
                 continue
             done = max((r.iou for r in self.landed), default=0.0)
-            if step >= len(first) and done >= LANDED_WELL:
+            if done >= (LANDED_WELL if step >= len(first) else LANDED_WHOLLY):
                 break
             if self._took and self.evaluations + np.mean(self._took) > self.limit:
                 break

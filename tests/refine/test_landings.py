@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from mjx_fitness import Scores
-from own_clip import OwnClip, SCENES, perturbed
+from own_clip import SCENES, OwnClip, perturbed
 
 import mjx_refine.search.run as run_module
 from mjx_refine import Options, refine
@@ -28,7 +28,8 @@ def landed(rank: int, fitness: float) -> Landed:
 def test_the_second_landing_is_from_another_sample():
     poor = [landed(0, 0.5), landed(0, 0.7), landed(2, 0.6), landed(1, 0.4)]
     second = second_landing(poor, LEAST)
-    assert second is not None and (second.rank, second.fitness) == (2, 0.6)
+    assert second is not None
+    assert (second.rank, second.fitness) == (2, 0.6)
     assert second_landing(poor, LEAST - 1) is None
     assert second_landing(poor[:2], LEAST) is None
     assert second_landing([*poor, landed(3, 0.95)], LEAST) is None
@@ -132,7 +133,8 @@ def test_samples_that_cannot_begin_right_land_last(clip):
     run = Run(problem, Quiet(), None, False)
     far = next(rank for rank, start in enumerate(problem.starts) if start.index == 0)
     run.landings._order = order = run.landings._heats()
-    assert order[0] != far and order.index(far) >= 3
+    assert order[0] != far
+    assert order.index(far) >= 3
     assert sorted(order) == list(range(5))
     # The heats are counted, and cheap.
     assert 0 < run.landings.evaluations < 0.25 * run.landings.limit
