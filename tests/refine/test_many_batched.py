@@ -25,7 +25,6 @@ from mjx_refine.search.together import Member, Together
 from mjx_refine.sim import backends
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.sim.mjx import room
-from mjx_refine.sim.warp import warp_problem
 from mjx_refine.simulate import simulate
 from mjx_refine.space import Space
 from mjx_refine.view import grid
@@ -299,7 +298,6 @@ def test_a_scene_with_an_effect_is_refined_by_its_worker_alone(clips, tmp_path):
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(warp_problem() is not None, reason="no NVIDIA GPU with Warp")
 def test_clips_are_searched_together_on_a_gpu(clips, tmp_path):
     """Two groups side by side, and costs near those of C MuJoCo where nothing is chaotic yet."""
     options = dataclasses.replace(TINY, optimizer="cmaes", backend="warp", population=16)
