@@ -7,9 +7,11 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import HeldOut, held_out
+from mjx_refine.diagnosis.hypothesis import Term
 from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Value, Verdict
 from mjx_refine.diagnosis.search import Candidate, Compared, compare, view_of
@@ -267,29 +269,41 @@ def _rms(clip: ClipFit, fit: Fit) -> float:
 
 
 def _values(clip: ClipFit, fit: Fit, k: int) -> dict[str, Value]:
-    """Parameters with 90 % intervals from the curvature, widened where the fit leaves more than noise."""
+    """Parameters of one effect with 90 % intervals from the curvature, widened where the fit leaves more than noise."""
     hypothesis = fit.hypothesis
-    t = hypothesis.terms[k]
     covariance = np.linalg.inv(fit.curvature) * max(1.0, clip.misfit(fit))
     first = hypothesis.space.dimension + sum(int(o.free.sum()) for o in hypothesis.terms[:k])
-    deviation = np.zeros(len(t.centre))
-    deviation[t.free] = np.sqrt(np.diag(covariance))[first : first + int(t.free.sum())] * t.width[t.free]
     values = hypothesis.values(fit.z[None], k)[0]
+    return values_of(hypothesis.terms[k], values, np.sqrt(np.diag(covariance))[first:], clip.frames)
+
+
+def values_of(
+    term: Term, values: Float[np.ndarray, "values"], deviation: Float[np.ndarray, "coordinates"], frames: int
+) -> dict[str, Value]:
+    """Parameters of an effect with 90 % intervals; of what has many numbers their root mean square.
+
+    Args:
+      term: the effect.
+      values: all its numbers.
+      deviation: standard errors in prior widths, those of the term's free coordinates first.
+      frames: of the clip.
+    """
+    wide_all = np.zeros(len(term.centre))
+    wide_all[term.free] = 1.645 * deviation[: int(term.free.sum())] * term.width[term.free]
     result: dict[str, Value] = {}
     at = 0
-    for p in t.kind.parameters:
-        count = 1 if p.length == 0 else (clip.frames if p.length < 0 else p.length)
-        part, wide = values[at : at + count], 1.645 * deviation[at : at + count]
+    for p in term.kind.parameters:
+        count = 1 if p.length == 0 else (frames if p.length < 0 else p.length)
+        part, wide = values[at : at + count], wide_all[at : at + count]
         at += count
         if p.length == 0:
             low, high = max(float(part[0] - wide[0]), p.low), min(float(part[0] + wide[0]), p.high)
             result[p.name] = Value(float(part[0]), low, high, p.unit)
         else:
             centred = part - part.mean() if p.length < 0 else part
-            size = float(np.sqrt(np.mean(centred**2)))
-            error = float(np.sqrt(np.mean(wide**2)))
+            size, error = (float(np.sqrt(np.mean(row**2))) for row in (centred, wide))
             result[f"{p.name}_rms"] = Value(size, max(size - error, 0.0), size + error, p.unit)
-    if t.name == "camera_shake":
+    if term.name == "camera_shake":
         halves = values.reshape(2, -1)
         size = float(np.sqrt(np.mean((halves - halves.mean(1, keepdims=True)) ** 2)))
         result["amplitude"] = Value(size, 0.9 * size, 1.1 * size, "degree")

@@ -14,17 +14,12 @@ from mjx_refine.diagnosis.fitted import Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, settled
+from mjx_refine.diagnosis.pace import DAMPINGS, STEPS, Pace
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.slack import BIAS, Slack, impacts, kicked, slack_of, sustained, touching
 from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
 from mjx_refine.search.landing import slowed
 from mjx_refine.sim.backends import Simulator
-
-STEPS = (0.002, 0.02, 0.2)
-"""Of finite differences, in prior widths: the first follows what is smooth, the others see over the jags of contacts, and
-are tried where it leads no further."""
-
-DAMPINGS = np.array([0.03, 0.3, 1.0, 10.0, 100.0])
 
 SCALE = 5.0
 """Noise widths beyond which residuals count ever less."""
@@ -312,33 +307,23 @@ class ClipFit:
         z = np.clip(z, low, high)
         base, costs = self.residuals(hypothesis, z[None], keep, scale)
         base, cost = base[0], float(costs[0])
-        size, failed = STEPS[0], 0
-        jacobian = self.jacobian(hypothesis, z, base, keep, scale, size)
-        damping = 1.0
+        pace = Pace()
+        jacobian = self.jacobian(hypothesis, z, base, keep, scale, pace.size)
         for _ in range(iterations):
             price, slope = prior(hypothesis, z)
             gradient = jacobian.T @ base + slope * price
             curvature = jacobian.T @ jacobian + np.diag(slope**2)
-            trials = np.array([self._step(z, gradient, curvature, f, low, high) for f in DAMPINGS * damping])
+            trials = np.array([self._step(z, gradient, curvature, f, low, high) for f in DAMPINGS * pace.damping])
             moved, costs = self.residuals(hypothesis, trials, keep, scale)
             best = int(np.argmin(costs))
             gain = cost - float(costs[best])
             if gain > 0:
                 z, base, cost = trials[best], moved[best], float(costs[best])
-                damping = float(np.clip(damping * DAMPINGS[best], 1e-3, 1e3))
-            if gain < 0.05 + 1e-4 * cost:
-                failed += 1
-                if failed > len(STEPS):
-                    break
-                # First shorter steps, then other derivatives.
-                shorter = failed == 1 and gain <= 0
-                damping = min(300.0 * damping, 1e3) if shorter else 1.0
-                size = size if shorter else STEPS[(STEPS.index(size) + 1) % len(STEPS)]
-            else:
-                failed = 0
-            if gain > 0 or failed:
-                jacobian = self.jacobian(hypothesis, z, base, keep, scale, size)
-        if size != STEPS[0]:
+            if pace.done(gain, best, cost):
+                break
+            if gain > 0 or pace.failed:
+                jacobian = self.jacobian(hypothesis, z, base, keep, scale, pace.size)
+        if pace.size != STEPS[0]:
             jacobian = self.jacobian(hypothesis, z, base, keep, scale)
         return self._finished(hypothesis, z, base, jacobian)
 

@@ -100,7 +100,7 @@ class Run:
         self.history: list[Step] = []
         share = LANDING_SHARE if self.options.optimizer == "hybrid" else 1.0
         limit = int(share * self.options.budget)
-        self.landings = Landings(problem, self._automatic_squares, self._shown, limit)
+        self.landings = Landings(problem, self._squares, self.choice.automatic, self._shown, limit)
         self.evaluations = 0
         self.before = 0.0
         self._saved: tuple[dict, dict] | None = None
@@ -179,12 +179,7 @@ class Run:
         """Where least squares arrived so far."""
         return self.landings.landed
 
-    def _automatic_squares(self, start: Start, space: Space) -> LeastSquares:
-        squares = self._squares(start, space)
-        squares.automatic = self.choice.automatic(start, space)
-        return squares
-
-    def _squares(self, start: Start, space: Space, limit: int = 10**9) -> LeastSquares:
+    def _squares(self, start: Start, space: Space) -> LeastSquares:
         reference = self.problem.reference(start.scene.shapes)
         columns, image = self.problem.columns(start.matching), self.problem.observation.size
         return LeastSquares(
@@ -194,7 +189,6 @@ class Run:
             columns,
             image,
             flow=self.problem.flow,
-            limit=limit,
             seed=self.options.seed,
             solver=self.options.solver,
             fps=reference.fps,
@@ -273,13 +267,10 @@ class Run:
         backend = self.problem.backends[kind_of_scene(first.start.given)]
         if backend != "mujoco":
             backend = fastest(self.options.backend, self.options.population)
-        fps, simulators = self.problem.observation.fps, []
-        for contender in race.contenders:
-            simulators.append(make_simulator(backend, contender.space.scene.shapes, fps, quick=True))
-        objectives = [
-            self._objective(c.start, c.space, simulator)
-            for c, simulator in zip(race.contenders, simulators, strict=True)
-        ]
+        kinds = {contender.space.scene.shapes for contender in race.contenders}
+        fps = self.problem.observation.fps
+        simulators = {shapes: make_simulator(backend, shapes, fps, quick=True) for shapes in kinds}
+        objectives = [self._objective(c.start, c.space, simulators[c.space.scene.shapes]) for c in race.contenders]
         while (turn := race.turn()) is not None:
             k, points = turn
             costs, scores = objectives[k](points)
@@ -289,7 +280,8 @@ class Run:
                 self._step("search", race.contenders[race.winner].search.best, race.contenders[k].search.spread)
                 self._saved = race.saved()
                 self._save()
-        return race.contenders[race.winner], simulators[race.winner]
+        winner = race.contenders[race.winner]
+        return winner, simulators[winner.space.scene.shapes]
 
     # Finish -------------------------------------------------------------------------------------------------------
 

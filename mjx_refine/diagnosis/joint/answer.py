@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from mjx_refine.diagnosis.diagnose import chance, verdict_of
+from mjx_refine.diagnosis.diagnose import chance, values_of, verdict_of
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.heldout import Outside
 from mjx_refine.diagnosis.joint.search import JointCandidate, JointCompared
@@ -121,7 +121,7 @@ def ranked(
         sentence = t.kind.sentence.format(target=target or "", shape=scene.shapes[t.target] if t.target >= 0 else "")
         found = judged.get(id(candidate))
         after, closed = (found.numbers[1], found.closed) if found else (math.nan, math.nan)
-        values = values_of(clips, candidate.fit, k)
+        values = _values(clips, candidate.fit, k)
         return Ranked(t.name, target, probability, candidate.lead, values, after, closed, sentence)
 
     pair = told.best is not None and len(told.best.names) > 1
@@ -136,26 +136,11 @@ def ranked(
     return (*rows, *sorted(others, key=lambda r: (-r.probability, -r.evidence)))
 
 
-def values_of(clips: Clips, fit: JointFit, k: int) -> dict[str, Value]:
-    """Parameters of one effect with 90 % intervals from the curvature, widened where the fit leaves more than noise."""
-    t = fit.hypothesis.terms[k]
+def _values(clips: Clips, fit: JointFit, k: int) -> dict[str, Value]:
+    """Parameters of one effect, as of one clip."""
     covariance = np.linalg.inv(fit.curvature.schur) * max(1.0, clips.misfit(fit))
     # Shared coordinates: the base model's, then the terms'.
     terms = fit.hypothesis.terms
     first = fit.hypothesis.count - sum(int(o.free.sum()) for o in terms[k:])
-    deviation = np.zeros(len(t.centre))
-    deviation[t.free] = np.sqrt(np.diag(covariance))[first : first + int(t.free.sum())] * t.width[t.free]
     values = fit.hypothesis.values(fit.z[None], k)[0]
-    result: dict[str, Value] = {}
-    at = 0
-    for p in t.kind.parameters:
-        count = 1 if p.length == 0 else (clips.frames if p.length < 0 else p.length)
-        part, wide = values[at : at + count], 1.645 * deviation[at : at + count]
-        at += count
-        if p.length == 0:
-            low, high = max(float(part[0] - wide[0]), p.low), min(float(part[0] + wide[0]), p.high)
-            result[p.name] = Value(float(part[0]), low, high, p.unit)
-        else:
-            size, error = (float(np.sqrt(np.mean(row**2))) for row in (part, wide))
-            result[f"{p.name}_rms"] = Value(size, max(size - error, 0.0), size + error, p.unit)
-    return result
+    return values_of(terms[k], values, np.sqrt(np.diag(covariance))[first:], clips.frames)

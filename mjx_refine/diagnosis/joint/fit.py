@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mjx_refine.batch import concatenate
-from mjx_refine.diagnosis.fit import DAMPINGS, SCALE, STEPS, ClipFit, Fit, prior
+from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.joint.arrow import Arrow
 from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis, with_frozen_setup
+from mjx_refine.diagnosis.pace import DAMPINGS, STEPS, Pace
 from mjx_refine.diagnosis.store import Arrays, fingerprint, packed, remembered, unpacked
 from mjx_refine.effects import acting
 
@@ -189,28 +190,20 @@ class Clips:
         z = np.clip(z, low, high)
         rows, costs = self.residuals(hypothesis, z[None], keeps, scale)
         base, cost = [row[0] for row in rows], float(costs[0])
-        size, failed, damping = STEPS[0], 0, 1.0
+        pace = Pace()
         fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale))
         for _ in range(iterations):
             gradient, curvature = fit.gradient, fit.curvature
-            trials = np.array([_step(z, gradient, curvature, f, low, high) for f in DAMPINGS * damping])
+            trials = np.array([_step(z, gradient, curvature, f, low, high) for f in DAMPINGS * pace.damping])
             rows, costs = self.residuals(hypothesis, trials, keeps, scale)
             best = int(np.argmin(costs))
             gain = cost - float(costs[best])
             if gain > 0:
                 z, base, cost = trials[best], [row[best] for row in rows], float(costs[best])
-                damping = float(np.clip(damping * DAMPINGS[best], 1e-3, 1e3))
-            if gain < 0.05 + 1e-4 * cost:
-                failed += 1
-                if failed > len(STEPS):
-                    break
-                shorter = failed == 1 and gain <= 0
-                damping = min(300.0 * damping, 1e3) if shorter else 1.0
-                size = size if shorter else STEPS[(STEPS.index(size) + 1) % len(STEPS)]
-            else:
-                failed = 0
-            fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale, size))
-        if size != STEPS[0] or fit.z is not z:
+            if pace.done(gain, best, cost):
+                break
+            fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale, pace.size))
+        if pace.size != STEPS[0] or fit.z is not z:
             fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale))
         return fit
 

@@ -7,11 +7,12 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from mjx_refine.diagnosis.fit import Fit
-from mjx_refine.diagnosis.joint.heldout import EARLY, early_part
+from mjx_refine.diagnosis.joint.heldout import early_part
 from mjx_refine.diagnosis.joint.hypothesis import common_scenes
 from mjx_refine.diagnosis.joint.together import (
     Course,
@@ -29,7 +30,7 @@ from mjx_refine.diagnosis.poses.fit import VIDEO, PosesFit, rate_of
 from mjx_refine.diagnosis.poses.heldout import Errors, errors_of
 from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.diagnosis.poses.where import describe, misfit_map, seen_frames
-from mjx_refine.diagnosis.result import ClipGap, Diagnosis, PoseErrors
+from mjx_refine.diagnosis.result import ClipGap, Diagnosis, Gap, PoseErrors
 from mjx_refine.diagnosis.search import view_of
 from mjx_refine.diagnosis.store import Store
 from mjx_refine.effects import catalogue
@@ -37,6 +38,8 @@ from mjx_refine.effects.kind import FitView
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene
 from mjx_refine.sim.c import MujocoSimulator
+
+_Gap = TypeVar("_Gap", Gap, ClipGap)
 
 
 def diagnose_recordings(
@@ -64,13 +67,9 @@ def diagnose_recordings(
       InputError: scenes differ in kind or have effects, names do not match, nothing moves, or there are too few samples.
     """
     began = time.monotonic()
-    told = told or (lambda line: None)
     set_up = Recordings(matched(scenes, len(poses), "recordings"), poses, threads)
     left_out = (*without, *(name for name, kind in catalogue().items() if not kind.physical))
-    for clip in set_up.clips:
-        clip.store = store or clip.store
-    course = run(set_up, scenes[0].names, left_out, seed, told)
-    told("report")
+    course = run(set_up, scenes[0].names, left_out, seed, told, store)
     return _result(course, set_up, seed, began)
 
 
@@ -129,21 +128,8 @@ class Recordings(SetUp):
 def _result(course: Course, set_up: Recordings, seed: int, began: float) -> Diagnosis:
     sides = [_later(set_up, course.judged, told) for told in (course.rated.before, course.rated.after)]
     before, after = (_middle(side) for side in sides)
-    gap = numbers(
-        course,
-        "positions and rotations against the measured ones, root mean square over what was foretold of each held-out "
-        "recording, median over these, in widths of the noise",
-        f"{', '.join(set_up.names[k] for k in course.judged)}: from {100 * EARLY:.0f} % of their time on; only their starts "
-        "were fitted, on what is before",
-        seed,
-    )
-    gap = dataclasses.replace(
-        gap,
-        position_before=before.position,
-        position_after=after.position,
-        rotation_before=before.rotation,
-        rotation_after=after.rotation,
-    )
+    gap = numbers(course, "positions and rotations against the measured ones", "recording", seed)
+    gap = _with_errors(gap, [before, after])
     clips = course.clips.clips
     plain = _middle([_root(errors_of(c, p)) for c, p in zip(clips, course.compared.plain.parts, strict=True)])  # type: ignore[arg-type]
     first, seen = set_up.clips[0], seen_frames(set_up.clips[0])
@@ -191,7 +177,7 @@ def _gaps(course: Course, set_up: Recordings, sides: list[list[Errors]]) -> tupl
     return tuple(rows[k] for k in sorted(rows))
 
 
-def _with_errors(gap: ClipGap, told: list[Errors]) -> ClipGap:
+def _with_errors(gap: _Gap, told: list[Errors]) -> _Gap:
     return dataclasses.replace(
         gap,
         position_before=told[0].position,

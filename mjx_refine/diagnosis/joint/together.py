@@ -12,11 +12,12 @@ from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.joint.answer import Said, ranked, said, to_judge
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
-from mjx_refine.diagnosis.joint.heldout import Foretold, Outside, early_part, excused, foretell, split
+from mjx_refine.diagnosis.joint.heldout import EARLY, Foretold, Outside, early_part, excused, foretell, split
 from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis
 from mjx_refine.diagnosis.joint.search import JointCandidate, JointCompared, Seen, compare_together
 from mjx_refine.diagnosis.joint.slack import GRID
 from mjx_refine.diagnosis.result import ClipGap, Diagnosis, Gap, Place, PoseErrors
+from mjx_refine.diagnosis.store import Store
 from mjx_refine.diagnosis.verdict import LITTLE
 from mjx_refine.diagnosis.where import places_of
 from mjx_refine.effects.kind import FitView
@@ -141,7 +142,12 @@ def check_once(arrays: Sequence[tuple[np.ndarray, ...]], names: Sequence[str]) -
 
 
 def run(
-    set_up: SetUp, names: tuple[str, ...], without: Sequence[str], seed: int, told: Callable[[str], None]
+    set_up: SetUp,
+    names: tuple[str, ...],
+    without: Sequence[str],
+    seed: int,
+    told: Callable[[str], None] | None,
+    store: Store | None,
 ) -> Course:
     """Fits some clips and judges on the others.
 
@@ -151,7 +157,11 @@ def run(
       without: effects that are left out.
       seed: of everything random.
       told: called with a line for each step.
+      store: where finished fits are kept.
     """
+    told = told or (lambda line: None)
+    for clip in set_up.clips:
+        clip.store = store or clip.store
     fitted, judged = split(len(set_up.clips), seed)
     clips = Clips([set_up.clips[k] for k in fitted])
     hypothesis = JointHypothesis(tuple(Hypothesis(set_up.spaces[k]) for k in fitted))
@@ -164,6 +174,7 @@ def run(
     outside = _outside(set_up, compared, judged, seed, told)
     answer = said(clips, compared, outside, set_up.least, seed)
     judging = next(o for c, o in outside if answer.shown is None or c is answer.shown)
+    told("report")
     return Course(set_up, fitted, judged, clips, compared, outside, answer, judging)
 
 
@@ -244,8 +255,18 @@ def result(
     )
 
 
-def numbers(course: Course, metric: str, held_out: str, seed: int) -> Gap:
-    """The gap in noise widths; what it is in pictures or metres is added by others."""
+def numbers(course: Course, measured: str, source: str, seed: int) -> Gap:
+    """The gap in noise widths; what it is in pictures or metres is added by others.
+
+    Args:
+      measured: what is held against what.
+      source: what one of the clips is called.
+    """
+    metric = f"{measured}, root mean square over what was foretold of each held-out {source}, median over these, in noise widths"
+    held_out = (
+        f"{', '.join(course.set_up.names[k] for k in course.judged)}: from {100 * EARLY:.0f} % of their time on; only their "
+        "starts were fitted, on what is before"
+    )
     before, after, floor = course.rated.numbers
     low, high = course.rated.interval(seed)
     nan = float("nan")

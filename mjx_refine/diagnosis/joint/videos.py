@@ -12,7 +12,7 @@ import numpy as np
 from mjx_refine.diagnosis.base import base_space, stored_base
 from mjx_refine.diagnosis.diagnose import prepared
 from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.joint.heldout import EARLY, Foretold
+from mjx_refine.diagnosis.joint.heldout import Foretold
 from mjx_refine.diagnosis.joint.hypothesis import common_scenes
 from mjx_refine.diagnosis.joint.together import (
     Course,
@@ -67,12 +67,8 @@ def diagnose_clips(
     began = time.monotonic()
     if len(observations) < 2:
         raise InputError(f"{len(observations)} clips; expected two and more of one set-up; `diagnose` takes one")
-    told = told or (lambda line: None)
     set_up = Videos(matched(scenes, len(observations), "clips"), observations, threads)
-    for clip in set_up.clips:
-        clip.store = store or clip.store
-    course = run(set_up, scenes[0].names, without, seed, told)
-    told("report")
+    course = run(set_up, scenes[0].names, without, seed, told, store)
     return _result(course, set_up, seed, began)
 
 
@@ -118,14 +114,7 @@ class Videos(SetUp):
 
 
 def _result(course: Course, set_up: Videos, seed: int, began: float) -> Diagnosis:
-    gap = numbers(
-        course,
-        "centroids, outlines, flow, background against the clip, root mean square over what was foretold of each held-out "
-        "clip, median over these, in noise widths",
-        f"{', '.join(set_up.names[k] for k in course.judged)}: from {100 * EARLY:.0f} % of their time on; only their starts "
-        "were fitted, on what is before",
-        seed,
-    )
+    gap = numbers(course, "centroids, outlines, flow, background against the clip", "clip", seed)
     before, after = (_scores(set_up, course.judged, told) for told in (course.rated.before, course.rated.after))
     gap = dataclasses.replace(gap, iou_before=before[0], iou_after=after[0], epe_before=before[1], epe_after=after[1])
     first, parts = set_up.clips[0], [fit.parts[0] for fit in (course.base, course.shown)]
