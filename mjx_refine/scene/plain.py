@@ -13,6 +13,11 @@ from mjx_refine.scene import fields
 MAX_BYTES = 32 * 2**20
 MAX_NODES = 100_000
 
+WORDS = ("name", "init", "video")
+"""Keys whose values are words as they are written: YAML would read the name ``000_1`` as 1 and ``no`` as false."""
+
+_NO_WORDS = tuple(f"tag:yaml.org,2002:{kind}" for kind in ("int", "float", "bool", "timestamp"))
+
 
 def read_text(path: str | os.PathLike, what: str) -> str:
     """The UTF-8 text of a file of at most ``MAX_BYTES``; ``what`` was expected, for errors.
@@ -66,13 +71,15 @@ class _UniqueKeyLoader(yaml.SafeLoader):
 
 def _construct_mapping(loader: _UniqueKeyLoader, node: yaml.MappingNode) -> dict:
     seen = set()
-    for key_node, _ in node.value:
+    for key_node, value_node in node.value:
         key = key_node.value if isinstance(key_node, yaml.ScalarNode) else None
         if key in seen:
             raise yaml.constructor.ConstructorError(
                 None, None, f"the key {fields.show(key)} stands twice", key_node.start_mark
             )
         seen.add(key)
+        if key in WORDS and isinstance(value_node, yaml.ScalarNode) and value_node.tag in _NO_WORDS:
+            value_node.tag = yaml.resolver.BaseResolver.DEFAULT_SCALAR_TAG
     return yaml.SafeLoader.construct_mapping(loader, node, deep=True)
 
 

@@ -24,6 +24,9 @@ TRIAL = 0.25
 LEAST = 4000
 """Rollouts left below which only the best landing is searched from."""
 
+SETTLED = 0.002
+"""Gain of fitness over the last third of a search's generations below which it has settled: what is left of it is polish."""
+
 OPEN = 0.5
 """Spread of the second search's first generation [prior widths]: it has a basin to find, not to follow."""
 
@@ -49,7 +52,16 @@ class Contender:
         one that has settled a little higher."""
         if not self.trail:
             return -np.inf
-        return 2 * self.trail[-1] - self.trail[2 * (len(self.trail) - 1) // 3]
+        return self.trail[-1] + self._gain
+
+    @property
+    def settled(self) -> bool:
+        """Whether it gained next to nothing over the last third of its generations."""
+        return bool(self.trail) and self._gain < SETTLED
+
+    @property
+    def _gain(self) -> float:
+        return self.trail[-1] - self.trail[2 * (len(self.trail) - 1) // 3]
 
 
 class Race:
@@ -75,11 +87,12 @@ class Race:
         return None
 
     def _line(self) -> list[int]:
-        """Those on trial in order, then all by their promise: where a search ends early, the next one goes on."""
+        """Those on trial in order, then all by their promise, one that has settled after those that still climb: where a
+        search ends early, the next one goes on."""
         numbers = range(len(self.contenders))
         spent = [len(c.trail) * c.search.population for c in self.contenders]
         on_trial = [k for k in numbers if spent[k] < self._trial]
-        return on_trial + sorted(numbers, key=lambda k: -self.contenders[k].promise)
+        return on_trial + sorted(numbers, key=lambda k: (self.contenders[k].settled, -self.contenders[k].promise))
 
     def told(self, k: int, points: np.ndarray, costs: np.ndarray, scores: Scores) -> bool:
         """Takes the costs and scores of points of contender ``k``; True where that was a generation."""

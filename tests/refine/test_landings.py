@@ -77,6 +77,12 @@ def test_the_one_that_still_climbs_gets_the_rest(climber):
     assert running.evaluations <= 4000
 
 
+def test_one_that_has_settled_waits_for_one_below_that_still_climbs():
+    turns = driven(race(), (0.7, 1.0), (0.0, 2e-3))
+    trial = turns.index(1)
+    assert set(turns[2 * trial :]) == {1}
+
+
 def test_a_race_goes_on_from_what_it_saved():
     whole, broken = race(), race()
     driven(whole, (1.0, 1.0), (1e-3, 2e-3))

@@ -25,6 +25,9 @@ JOBS = """\
 - {name: third, init: /data/c.yaml, video: c.npz, optimizer: cmaes}
 """
 
+WRITTEN = ("000_1", "0x10", "007", "1e3", "no", "2026-01-05", "17")
+"""Words that YAML would take for something else."""
+
 
 def jobs_file(folder: Path, text: str) -> Path:
     path = folder / "jobs.yaml"
@@ -71,6 +74,14 @@ def test_wrong_jobs_are_told(text, says, tmp_path):
     with pytest.raises(InputError, match=says) as told:
         load_jobs(path)
     assert str(told.value).startswith(str(path))
+
+
+@pytest.mark.parametrize("word", WRITTEN)
+def test_names_are_read_as_they_are_written(word, tmp_path):
+    text = f"- {{name: '{word}', init: a, video: b.npz}}\n- {{name: c{word}, init: '{word}', video: b.npz}}"
+    quoted = load_jobs(jobs_file(tmp_path, text))
+    assert load_jobs(jobs_file(tmp_path, text.replace("'", ""))) == quoted
+    assert quoted[0].name == quoted[1].init.name == word
 
 
 def test_jobs_from_python_are_checked():
