@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.batch import SceneBatch, batch_from_scenes, concatenate
-from mjx_refine.scene import Body, Camera, Scene
+from mjx_refine.scene import Body, Camera, Scene, Shape
 from mjx_refine.sim.backends import Simulator, make_simulator
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.sim.model import SUBSTEPS, apply_fields, build_spec, initial_state, model_fields
@@ -208,7 +208,18 @@ def measure(name: str, damping: float, batch: SceneBatch, simulator: Simulator, 
     )
 
 
-def run(backend: str, count: int, seed: int, chosen: list[str] | None, dampings: list[float]) -> list[Row]:
+def simulator_of(backend: str, shapes: tuple[Shape, ...], any_device: bool) -> Simulator:
+    """The backend; ``any_device``: MJX-Warp's kernels on a CPU, where there is no GPU."""
+    if any_device and backend == "warp":
+        from mjx_refine.sim.warp import WarpSimulator
+
+        return WarpSimulator(shapes, FPS, any_device=True)
+    return make_simulator(backend, shapes, FPS)
+
+
+def run(
+    backend: str, count: int, seed: int, chosen: list[str] | None, dampings: list[float], any_device: bool = False
+) -> list[Row]:
     """Measures and prints every row; scenes of one kind share a compiled program."""
     heading = f"{'row':18}{'damping':>8}{'before':>10}{'meeting':>10}{'median':>10}{'worst':>10}{'C spread':>10}"
     print(f"{heading}{'NaN':>5}{'s':>8}  verdict", flush=True)
@@ -220,7 +231,7 @@ def run(backend: str, count: int, seed: int, chosen: list[str] | None, dampings:
             bodies = {**single_rows(damping), **pair_rows(damping)}[name]
             batch = scene_batch(bodies, count, seed + names.index(name))
             if batch.shapes not in simulators:
-                pair = (make_simulator(backend, batch.shapes, FPS), MujocoSimulator(batch.shapes, FPS))
+                pair = (simulator_of(backend, batch.shapes, any_device), MujocoSimulator(batch.shapes, FPS))
                 simulators[batch.shapes] = pair
             row = measure(name, damping, batch, *simulators[batch.shapes])
             rows.append(row)
@@ -239,11 +250,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rows", help="names, separated by commas; all by default")
     parser.add_argument("--damping", help="dampings, separated by commas", default="-4,-30")
+    parser.add_argument("--any-device", action="store_true", help="warp: run its kernels on a CPU, slowly")
     parser.add_argument("--json", type=Path, help="also write the rows here")
     arguments = parser.parse_args()
     chosen = arguments.rows.split(",") if arguments.rows else None
     dampings = [float(text) for text in arguments.damping.split(",")]
-    rows = run(arguments.backend, arguments.count, arguments.seed, chosen, dampings)
+    rows = run(arguments.backend, arguments.count, arguments.seed, chosen, dampings, arguments.any_device)
     if arguments.json:
         machine = {
             "machine": platform.machine(),
