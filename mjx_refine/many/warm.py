@@ -13,7 +13,7 @@ from mjx_refine.observation import load_observation
 from mjx_refine.scene import Shape, load_scenes
 from mjx_refine.search import Options
 from mjx_refine.search.objective import launched
-from mjx_refine.search.run import search_resolution
+from mjx_refine.search.options import search_resolution
 from mjx_refine.search.together import CANDIDATES, DEVICE
 from mjx_refine.sim.backends import Simulator, fastest
 from mjx_refine.view.grid import GridScorer, sampled

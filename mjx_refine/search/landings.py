@@ -30,6 +30,9 @@ and 7 to 9 were seen."""
 LANDED_WHOLLY = 0.99
 """IoU of a landing after which no other sample lands: what is left is for the population search."""
 
+LANDED_CLEARLY, DEAR = 0.97, 0.1
+"""The same where another landing would take more than this part of what landings may spend."""
+
 HOPELESS = 4.0
 """A sample whose cost in a heat is more than so many times the best one's waits for those that are better; a landing
 whose cost at a horizon is, is broken off."""
@@ -88,7 +91,7 @@ class Landings:
             if step < self._planned:
                 continue
             done = max((r.iou for r in self.landed), default=0.0)
-            if done >= (LANDED_WELL if step >= len(first) else LANDED_WHOLLY):
+            if done >= (LANDED_WELL if step >= len(first) else self._enough()):
                 break
             if self._took and self.evaluations + np.mean(self._took) > self.limit:
                 break
@@ -100,6 +103,11 @@ class Landings:
             self.landed.append(self._land(rank, hops))
             self._planned = step + 1
             keep()
+
+    def _enough(self) -> float:
+        """IoU of a landing after which no other sample lands."""
+        dear = self._took and np.mean(self._took) > DEAR * self.limit
+        return LANDED_CLEARLY if dear else LANDED_WHOLLY
 
     # Heats --------------------------------------------------------------------------------------------------------
 

@@ -12,6 +12,12 @@ OPTIMIZERS = ("hybrid", "cmaes", "gradient")
 
 DERIVATIVES = ("auto", "differences", "autodiff")
 
+SEARCH_WIDTH = 160
+"""Samples across a picture during the search, by default."""
+
+FINER = 2
+"""Times as many samples across and down a picture in the last part of the search."""
+
 SOLVERS = ("lm", "adam", "gauss-newton", "levenberg-marquardt")
 
 
@@ -75,3 +81,11 @@ class Options:
     def budget(self) -> int:
         """Rollouts in all."""
         return self.population * self.iterations
+
+
+def search_resolution(options: Options, size: tuple[int, int], fine: bool = False) -> tuple[int, int]:
+    """(width, height) of the samples at which a search compares pictures of ``size``; ``fine``: in its last part."""
+    width, height = size
+    wanted = options.resolution or (SEARCH_WIDTH, round(SEARCH_WIDTH * height / width))
+    times = FINER if fine else 1
+    return min(width, times * wanted[0]), min(height, times * max(wanted[1], 8))

@@ -19,6 +19,9 @@ GENERATIONS = 80
 """Generations for which the budget after a landing must suffice; the population shrinks, down to CMA-ES's default
 4 + 3 ln n (Hansen, The CMA Evolution Strategy: A Tutorial, 2023, table 1), until it does."""
 
+POLISHING = 120
+"""The same after a good landing: following one basin takes fewer candidates than finding one."""
+
 ELITES = 8
 """Candidates of the search that are compared at full resolution in the end."""
 
@@ -41,6 +44,7 @@ class PopulationSearch:
       evaluations: rollouts spent.
       reason: why the search ended, None before.
       best: (fitness, IoU, EPE [px]) of the best candidate of all generations, at the search's resolution.
+      fine: whether that is the finer one, see ``refocus``.
     """
 
     def __init__(
@@ -58,8 +62,9 @@ class PopulationSearch:
         self.best = (-np.inf, 0.0, 0.0)
         self.reason: str | None = None
         self.state: mjx_cmaes.State | None = None
+        self.fine = self._refocused = False
         left = options.budget - evaluations
-        self._population(self._fitting(int(part * left)))
+        self._population(self._fitting(int(part * left), POLISHING if landed else GENERATIONS))
         self._probing = landed and left > PROBING
         self.elites, self._costs = mean[None], np.full(1, np.inf)
         if left < self.population:
@@ -69,12 +74,12 @@ class PopulationSearch:
         self.population = count
         self.settings = mjx_cmaes.Settings(dimension=len(self.mean), population=count)
 
-    def _fitting(self, left: int) -> int:
-        """Candidates a generation: after a landing, few enough for ``GENERATIONS`` with what is left."""
+    def _fitting(self, left: int, generations: int) -> int:
+        """Candidates a generation: after a landing, few enough for so many generations with what is left."""
         if self.options.optimizer == "cmaes":
             return self.options.population
         least = min(self.options.population, 4 + int(3 * np.log(len(self.mean))))
-        return int(np.clip(left // GENERATIONS, least, self.options.population))
+        return int(np.clip(left // generations, least, self.options.population))
 
     def points(self) -> Float[np.ndarray, "batch dimension"] | None:
         """The next points whose costs are wanted; None where the search has ended, ``reason`` then says why."""
@@ -97,7 +102,15 @@ class PopulationSearch:
         points, self.state = mjx_cmaes.ask(self.settings, self.state)
         if self.state.generation == 0:
             points = mjx_cmaes.inject(points, np.stack([self.mean, self.start]))
+        elif self._refocused:
+            points = mjx_cmaes.inject(points, np.stack([np.clip(self.state.mean, 0, 1), self.elites[0]]))
         return points
+
+    def refocus(self) -> None:
+        """From the next generation on, pictures are compared at another resolution: costs so far mean nothing there."""
+        self.fine = self._refocused = True
+        self.elites, self._costs = self.elites[:1], np.full(1, np.inf)
+        self.best = (-np.inf, 0.0, 0.0)
 
     @property
     def _seed(self) -> int:
@@ -117,6 +130,7 @@ class PopulationSearch:
             return False
         if self.state is None:
             raise RuntimeError("costs of points that nobody asked for")
+        self._refocused = False
         self.state, _ = mjx_cmaes.tell(self.settings, self.state, points, costs)
         self.evaluations += len(points)
         self.elites, self._costs, best = _merge(self.elites, self._costs, points, costs)
@@ -140,7 +154,7 @@ class PopulationSearch:
             return None
         arrays = {f"cma.{k}": v for k, v in mjx_cmaes.save_state(self.state).items()}
         arrays.update(elites=self.elites, elite_costs=self._costs)
-        return {"best": self.best, "population": self.population}, arrays
+        return {"best": self.best, "population": self.population, "fine": self.fine}, arrays
 
     def restore(self, values: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         """Goes on from what ``saved`` returned.
@@ -153,6 +167,7 @@ class PopulationSearch:
         state = {k.removeprefix("cma."): v for k, v in arrays.items() if k.startswith("cma.")}
         self.state = mjx_cmaes.load_state(self.settings, state)
         self.elites, self._costs = arrays["elites"], arrays["elite_costs"]
+        self.fine = bool(values.get("fine"))
         fitness, iou, epe = values["best"]
         self.best = (float(fitness), float(iou), float(epe))
 

@@ -24,6 +24,10 @@ TRIAL = 0.25
 LEAST = 4000
 """Rollouts left below which only the best landing is searched from."""
 
+FINE = 0.33
+"""Part of the rollouts left after the landings that is searched at a finer resolution: samples far apart are fitted
+beside the pixels between them."""
+
 SETTLED = 0.002
 """Gain of fitness over the last third of a search's generations below which it has settled: what is left of it is polish."""
 
@@ -70,15 +74,20 @@ class Race:
     Args:
       contenders: not begun yet.
       evaluations: rollouts spent before.
+      fine: whether the last part is searched at a finer resolution, by the most promising one alone.
     """
 
-    def __init__(self, contenders: list[Contender], options: Options, evaluations: int):
+    def __init__(self, contenders: list[Contender], options: Options, evaluations: int, fine: bool = False):
         self.contenders, self.evaluations = contenders, evaluations
         self._trial = int(TRIAL * (options.budget - evaluations)) if len(contenders) > 1 else 0
+        self._fine_from = options.budget - FINE * (options.budget - evaluations) if fine else np.inf
 
     def turn(self) -> tuple[int, np.ndarray] | None:
         """Whose points are to be evaluated next; None at the end."""
-        for k in self._line():
+        line = [k for k in self._line() if self.contenders[k].search.reason is None]
+        if self.evaluations >= self._fine_from and line:
+            line = [self._last(line)]
+        for k in line:
             search = self.contenders[k].search
             search.evaluations = self.evaluations
             points = search.points()
@@ -94,6 +103,14 @@ class Race:
         on_trial = [k for k in numbers if spent[k] < self._trial]
         return on_trial + sorted(numbers, key=lambda k: (self.contenders[k].settled, -self.contenders[k].promise))
 
+    def _last(self, line: list[int]) -> int:
+        """Who searches the finer part: the first in line when it begins."""
+        for k in line:
+            if self.contenders[k].search.fine:
+                return k
+        self.contenders[line[0]].search.refocus()
+        return line[0]
+
     def told(self, k: int, points: np.ndarray, costs: np.ndarray, scores: Scores) -> bool:
         """Takes the costs and scores of points of contender ``k``; True where that was a generation."""
         contender = self.contenders[k]
@@ -105,8 +122,11 @@ class Race:
 
     @property
     def winner(self) -> int:
-        """The contender that came highest; the first where none began."""
-        return max(range(len(self.contenders)), key=lambda k: (self.contenders[k].trail or [-np.inf])[-1])
+        """The contender of the finer part, or else the one that came highest; the first where none began."""
+        return max(
+            range(len(self.contenders)),
+            key=lambda k: (self.contenders[k].search.fine, (self.contenders[k].trail or [-np.inf])[-1]),
+        )
 
     def saved(self) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
         """(values, arrays) for a checkpoint, one search alone as it saves itself; None before the first generation."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from mjx_fitness import Scores
 
 from mjx_refine.effects import batch_with_effects
-from mjx_refine.scene import Scene
+from mjx_refine.scene import Scene, Shape
 from mjx_refine.search.checkpoint import damaged, input_digest, load_checkpoint, save_checkpoint
 from mjx_refine.search.derivatives import DerivativeChoice, Derivatives
 from mjx_refine.search.intervals import Intervals, intervals
@@ -18,7 +19,7 @@ from mjx_refine.search.landed import Landed, first_covariance, landed_well
 from mjx_refine.search.landing import LeastSquares
 from mjx_refine.search.landings import Landings
 from mjx_refine.search.objective import Objective
-from mjx_refine.search.options import Options
+from mjx_refine.search.options import search_resolution
 from mjx_refine.search.population import PopulationSearch
 from mjx_refine.search.problem import Problem, Start, kind_of_scene
 from mjx_refine.search.progress import Progress, Step
@@ -30,9 +31,6 @@ from mjx_refine.sim.devices import has_accelerator, on_device
 from mjx_refine.space import Space
 from mjx_refine.view.effects import needs_pictures
 from mjx_refine.view.grid import GridScorer, sampled
-
-SEARCH_WIDTH = 160
-"""Samples across a picture during the search, by default."""
 
 LANDING_SHARE = 0.6
 """Part of the budget that least squares may spend before the population search (``hybrid``)."""
@@ -118,11 +116,6 @@ class Run:
         """Since the run began, earlier parts of a resumed run included."""
         return self.before + time.monotonic() - self.began
 
-    @property
-    def resolution(self) -> tuple[int, int]:
-        """(width, height) of the search's samples."""
-        return search_resolution(self.options, self.problem.observation.size)
-
     def __call__(self) -> Found:
         """Runs to the end."""
         if self.options.optimizer != "cmaes":
@@ -153,14 +146,21 @@ class Run:
             searched=where.seconds,
         )
 
-    def _objective(self, start: Start, space: Space, simulator=None) -> Objective:
-        reference = self.problem.reference(start.scene.shapes)
+    @property
+    def _finer(self) -> bool:
+        """Whether the search ends at a finer resolution: not at a user's own, nor on a device, which would compile anew."""
+        hybrid = self.options.optimizer == "hybrid" and self.options.resolution is None
+        return hybrid and not has_accelerator()
+
+    def _objective(self, start: Start, space: Space, simulator=None, fine: bool = False) -> Objective:
+        reference, size = self.problem.reference(start.scene.shapes), self.problem.observation.size
         pictures = needs_pictures(batch_with_effects([start.scene]))
         if simulator is not None and not pictures and has_accelerator():
-            clip = sampled(self.problem.observation, start.matching, self.resolution)
+            clip = sampled(self.problem.observation, start.matching, search_resolution(self.options, size))
             grid = GridScorer(start.scene.shapes, [clip], [self.options.weights])
             return Objective(space, simulator, reference, grid)
-        scorer = self.problem.scorer(start.scene.shapes, start.matching, self.resolution, pictures)
+        resolution = search_resolution(self.options, size, fine)
+        scorer = self.problem.scorer(start.scene.shapes, start.matching, resolution, pictures)
         return Objective(space, simulator or reference, reference, scorer)
 
     # Land ---------------------------------------------------------------------------------------------------------
@@ -232,10 +232,11 @@ class Run:
         self._save(force=True)
         if batch_with_effects([first.start.scene]).effects:
             return None
+        observation = self.problem.observation
         return Ready(
             shapes=first.start.scene.shapes,
-            fps=self.problem.observation.fps,
-            samples=sampled(self.problem.observation, first.start.matching, self.resolution),
+            fps=observation.fps,
+            samples=sampled(observation, first.start.matching, search_resolution(self.options, observation.size)),
             options=self.options,
             space=first.space,
             mean=first.mean,
@@ -252,7 +253,7 @@ class Run:
             PopulationSearch(options, b.mean, b.covariance, b.space.start, landed, before, part) for b in beginnings
         ]
         contenders = [Contender(b.start, b.space, s) for b, s in zip(beginnings, searches, strict=True)]
-        race = Race(contenders, options, before)
+        race = Race(contenders, options, before, self._finer)
         if self._saved is not None:
             try:
                 race.restore(*self._saved)
@@ -267,13 +268,20 @@ class Run:
         backend = self.problem.backends[kind_of_scene(first.start.given)]
         if backend != "mujoco":
             backend = fastest(self.options.backend, self.options.population)
-        kinds = {contender.space.scene.shapes for contender in race.contenders}
         fps = self.problem.observation.fps
-        simulators = {shapes: make_simulator(backend, shapes, fps, quick=True) for shapes in kinds}
-        objectives = [self._objective(c.start, c.space, simulators[c.space.scene.shapes]) for c in race.contenders]
+
+        @functools.cache
+        def simulator(shapes: tuple[Shape, ...]) -> Simulator:
+            return make_simulator(backend, shapes, fps, quick=True)
+
+        @functools.cache
+        def objective(k: int, fine: bool) -> Objective:
+            start, space = race.contenders[k].start, race.contenders[k].space
+            return self._objective(start, space, simulator(space.scene.shapes), fine)
+
         while (turn := race.turn()) is not None:
             k, points = turn
-            costs, scores = objectives[k](points)
+            costs, scores = objective(k, race.contenders[k].search.fine)(points)
             generation = race.told(k, points, costs, scores)
             self.evaluations = race.evaluations
             if generation:
@@ -281,7 +289,7 @@ class Run:
                 self._saved = race.saved()
                 self._save()
         winner = race.contenders[race.winner]
-        return winner, simulators[winner.space.scene.shapes]
+        return winner, simulator(winner.space.scene.shapes)
 
     # Finish -------------------------------------------------------------------------------------------------------
 
@@ -373,10 +381,3 @@ class Run:
         if values.get("searched") is not None:
             self._searched = Searched(*values["searched"])
         self.progress.message(f"resumed after {self.evaluations} rollouts")
-
-
-def search_resolution(options: Options, size: tuple[int, int]) -> tuple[int, int]:
-    """(width, height) of the samples at which a search compares pictures of ``size``."""
-    width, height = size
-    wanted = options.resolution or (SEARCH_WIDTH, round(SEARCH_WIDTH * height / width))
-    return min(width, wanted[0]), min(height, max(wanted[1], 8))

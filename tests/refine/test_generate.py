@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import multiprocessing
 import zipfile
 
 import mujoco
@@ -18,7 +19,8 @@ from mjx_refine.generate.options import LEAST_PIXELS, SIZE, combinations
 from mjx_refine.generate.physics import RecordingSimulator
 from mjx_refine.generate.pictures import Clip, draw_clips, expanded
 from mjx_refine.generate.record import differences, from_jpeg, from_members, jpeg, members, summed
-from mjx_refine.generate.rgb import _add_camera, _dress, check_renderer, film
+from mjx_refine.generate.renderer import VARIABLE, choose_renderer
+from mjx_refine.generate.rgb import _add_camera, _dress, film
 from mjx_refine.generate.sample import half_height, propose, rotated, shapes_of
 from mjx_refine.generate.tiles import HIGH, WIDE
 from mjx_refine.scene import Body, Camera, Scene, dump_scene, parse_scenes, write
@@ -398,15 +400,12 @@ def test_looks_compile_and_change_no_motion():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of contexts that could not be made
-def test_frames_masks_and_flow_agree(records):
-    """Needs OpenGL: MUJOCO_GL=egl pytest -m slow."""
-    try:
-        check_renderer()
-    except InputError as error:
-        pytest.skip(str(error))
+def test_frames_masks_and_flow_agree(records, monkeypatch):
+    """In a process of its own: MuJoCo's renderer is chosen once, when it is imported."""
+    monkeypatch.setenv(VARIABLE, choose_renderer())
     record = records[0]
-    seen = film(record, OPTIONS, 0)
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        seen = pool.apply(film, (record, OPTIONS, 0))
     assert isinstance(seen, Seen)
     errors = []
     for n in range(len(record.scene.objects)):

@@ -17,7 +17,7 @@ from mjx_refine.search.landed import Landed
 from mjx_refine.search.population import PopulationSearch
 from mjx_refine.search.problem import Problem
 from mjx_refine.search.progress import Progress
-from mjx_refine.search.race import LEAST, TRIAL, Contender, Race, second_landing
+from mjx_refine.search.race import FINE, LEAST, TRIAL, Contender, Race, second_landing
 from mjx_refine.search.run import Run
 
 
@@ -35,13 +35,13 @@ def test_the_second_landing_is_from_another_sample():
     assert second_landing([*poor, landed(3, 0.95)], LEAST) is None
 
 
-def race(budget: int = 4000) -> Race:
+def race(budget: int = 4000, fine: bool = False) -> Race:
     options = Options(population=20, iterations=budget // 20)
     searches = [
         PopulationSearch(options, np.full(3, 0.5), 0.01 * np.eye(3), np.full(3, 0.5), False, 0, 1 - TRIAL)
         for _ in range(2)
     ]
-    return Race([Contender(None, None, search) for search in searches], options, 0)  # type: ignore[arg-type]
+    return Race([Contender(None, None, search) for search in searches], options, 0, fine)  # type: ignore[arg-type]
 
 
 def scores(costs: np.ndarray) -> Scores:
@@ -81,6 +81,18 @@ def test_one_that_has_settled_waits_for_one_below_that_still_climbs():
     turns = driven(race(), (0.7, 1.0), (0.0, 2e-3))
     trial = turns.index(1)
     assert set(turns[2 * trial :]) == {1}
+
+
+def test_the_finer_part_is_for_the_first_in_line_alone():
+    running = race(fine=True)
+    turns = driven(running, (1.0, 0.99), (1e-3, 0.0))
+    fine = running.contenders[0].search
+    assert (fine.fine, running.contenders[1].search.fine, running.winner) == (True, False, 0)
+    # Coarse costs are forgotten: all that is kept was told in the last third, when costs were below any before.
+    last = FINE * 4000 / fine.population
+    assert set(turns[-int(last) :]) == {0}
+    assert fine.saved()[1]["elite_costs"].max() < 1.0 - 1e-3 * (turns.count(0) - last - 1) + 0.01 * 0.75  # type: ignore[index]
+    assert race(fine=False).contenders[0].search.fine is False
 
 
 def test_a_race_goes_on_from_what_it_saved():
@@ -146,18 +158,20 @@ def test_samples_that_cannot_begin_right_land_last(clip):
     assert 0 < run.landings.evaluations < 0.25 * run.landings.limit
 
 
-def test_a_run_killed_in_the_race_ends_where_the_whole_one_ends(clip, tmp_path, monkeypatch):
+@pytest.mark.parametrize("part", [0.4, 0.9])
+def test_a_run_killed_in_the_race_ends_where_the_whole_one_ends(part, clip, tmp_path, monkeypatch):
     monkeypatch.setattr(run_module, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("mjx_refine.search.options.SEARCH_WIDTH", 48)
     monkeypatch.setattr("mjx_refine.search.race.LEAST", 100)
     monkeypatch.setattr("mjx_refine.search.landed.LANDED_WELL", 2.0)
     monkeypatch.setattr("mjx_refine.search.landings.LANDED_WELL", 2.0)
-    options = Options(population=10, iterations=160, seed=1, refits=0, threads=1, resolution=(64, 48))
+    options = Options(population=10, iterations=160, seed=1, refits=0, threads=1)
     samples = Samples("drawn", tuple(perturbed(clip.scene, seed) for seed in (1, 2, 3)), (0, 1, 2))
     whole = refine(samples, observed(clip), options, folder=tmp_path / "whole")
     search = [k for k, step in enumerate(whole.history) if step.phase == "search"]
 
     class Interrupting(Progress):
-        left = search[len(search) * 2 // 3]
+        left = search[int(part * len(search))]
 
         def step(self, step) -> None:
             self.left -= 1
