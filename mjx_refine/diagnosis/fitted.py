@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -46,6 +47,20 @@ class Fit:
     def curvature(self) -> Float[np.ndarray, "dimension dimension"]:
         """Of the cost, by Gauss and Newton."""
         return self.jacobian.T @ self.jacobian + np.diag(prior(self.hypothesis, self.z)[1] ** 2)
+
+
+class Explained:
+    """A fit with effects: what they are."""
+
+    fit: Any
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(t.name for t in self.fit.hypothesis.terms)
+
+    @property
+    def targets(self) -> tuple[int, ...]:
+        return tuple(t.target for t in self.fit.hypothesis.terms)
 
 
 def prior(hypothesis: Hypothesis, z: Float[np.ndarray, "*batch dimension"]) -> tuple[np.ndarray, np.ndarray]:

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from mjx_refine.diagnosis.base import base_space, stored_base
 from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.fitted import Explained
 from mjx_refine.diagnosis.screen import Lead, Screen, term_of
 from mjx_refine.diagnosis.slack import spins, touching
 from mjx_refine.effects import catalogue
@@ -50,7 +51,7 @@ Told = Callable[[str], None]
 
 
 @dataclasses.dataclass(frozen=True)
-class Candidate:
+class Candidate(Explained):
     """One effect (or several) fitted together with the base parameters.
 
     Attributes:
@@ -62,14 +63,6 @@ class Candidate:
     fit: Fit
     lead: float
     promise: float
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(t.name for t in self.fit.hypothesis.terms)
-
-    @property
-    def targets(self) -> tuple[int, ...]:
-        return tuple(t.target for t in self.fit.hypothesis.terms)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mjx_refine.diagnosis.fit import SCALE, Fit
+from mjx_refine.diagnosis.fitted import Explained
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.screen import JointScreen
 from mjx_refine.diagnosis.joint.slack import set_slackness, with_slackness
@@ -33,7 +34,7 @@ PROMISE_OF_PAIRS = 15.0
 
 
 @dataclasses.dataclass(frozen=True)
-class JointCandidate:
+class JointCandidate(Explained):
     """One effect (or several) fitted together with the base parameters.
 
     Attributes:
@@ -43,14 +44,6 @@ class JointCandidate:
 
     fit: JointFit
     lead: float
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(t.name for t in self.fit.hypothesis.terms)
-
-    @property
-    def targets(self) -> tuple[int, ...]:
-        return tuple(t.target for t in self.fit.hypothesis.terms)
 
 
 @dataclasses.dataclass(frozen=True)
