@@ -35,9 +35,8 @@ from mjx_refine.files import write_text
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Body, Samples, Scene, load_scene
 from mjx_refine.search.objective import Objective
+from mjx_refine.search.options import search_resolution
 from mjx_refine.search.problem import Problem, Start
-from mjx_refine.search.progress import Progress
-from mjx_refine.search.run import Run
 from mjx_refine.search.schedule import HORIZONS
 from mjx_refine.space import Space
 
@@ -110,7 +109,7 @@ def _scores(scores) -> dict[str, float]:
 
 def _objective(problem: Problem, start: Start, space: Space) -> Objective:
     """What the population search minimises, by C MuJoCo at the search's resolution."""
-    resolution = Run(problem, Progress(), None, False).resolution
+    resolution = search_resolution(problem.options, problem.observation.size)
     reference = problem.reference(start.scene.shapes)
     return Objective(space, reference, reference, problem.scorer(start.scene.shapes, start.matching, resolution))
 
