@@ -25,7 +25,7 @@ RESTING = ("clearance", "tilt")
 
 TRUST = 0.2
 """Width of the prior around the given scene, in errors of a language model: the scene is thought to be refined. Its tails
-are heavy (``fit.TAIL``), so that a rough scene may move."""
+are heavy (``Hypothesis.tails``), so that a rough scene may move."""
 
 GOOD = 2.5
 """Mean square residual below which no further start is tried."""

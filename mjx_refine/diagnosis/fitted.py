@@ -11,9 +11,6 @@ from jaxtyping import Float
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.search.landing import slowed
 
-TAIL = 2.0
-"""Prior widths beyond which moving a base parameter costs ever less: half its price is TAIL^2 log(1 + (z / TAIL)^2)."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
@@ -65,8 +62,9 @@ class Explained:
 
 def prior(hypothesis: Hypothesis, z: Float[np.ndarray, "*batch dimension"]) -> tuple[np.ndarray, np.ndarray]:
     """The prior as residuals, and their derivatives in z: heavy-tailed for base parameters, normal for effects'."""
-    heavy = hypothesis.ordinary
-    residual = np.where(heavy, slowed(z, TAIL), z)
-    square = (z / TAIL) ** 2
-    slope = np.where(np.abs(z) > 1e-6, np.abs(z) / np.maximum((1 + square) * np.abs(residual), 1e-12), 1.0)
+    tails = hypothesis.tails
+    heavy = np.isfinite(tails)
+    tail = np.where(heavy, tails, 1.0)
+    residual = np.where(heavy, slowed(z, tail), z)
+    slope = np.where(np.abs(z) > 1e-6, np.abs(z) / np.maximum((1 + (z / tail) ** 2) * np.abs(residual), 1e-12), 1.0)
     return residual, np.where(heavy, np.maximum(slope, 0.1), 1.0)

@@ -13,6 +13,13 @@ from mjx_refine.effects.acting import on_the_floor
 from mjx_refine.scene import Effect, Scene
 from mjx_refine.space import Space
 
+TAIL = 6.0
+"""Prior widths beyond which moving a base parameter costs ever less: half its price is TAIL^2 log(1 + (z / TAIL)^2). Nearer
+tails let size, camera and velocity bend until they imitate an effect."""
+
+CONTACTS, CONTACT_TAIL = ("friction", "resistance"), 2.0
+"""Fields that mean something else in every engine, and on every real floor, and their tail."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Term:
@@ -90,6 +97,12 @@ class Hypothesis:
     def ordinary(self) -> Bool[np.ndarray, "dimension"]:
         """Which coordinates are the base model's."""
         return np.arange(self.dimension) < self.space.dimension
+
+    @property
+    def tails(self) -> Float[np.ndarray, "dimension"]:
+        """Prior widths beyond which moving each coordinate costs ever less; infinite for effects, whose prior is normal."""
+        told = [CONTACT_TAIL if p.field in CONTACTS else TAIL for p in self.space.parameters]
+        return np.concatenate([told, np.full(self.dimension - len(told), np.inf)])
 
     @property
     def moves(self) -> Bool[np.ndarray, "dimension"]:

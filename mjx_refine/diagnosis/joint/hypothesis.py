@@ -108,6 +108,14 @@ class JointHypothesis:
             result[index] = part.ordinary
         return result
 
+    @functools.cached_property
+    def tails(self) -> Float[np.ndarray, "dimension"]:
+        """Each coordinate's tail, see ``Hypothesis.tails``."""
+        result = np.empty(self.dimension)
+        for part, index in zip(self.parts, self.index, strict=True):
+            result[index] = part.tails
+        return result
+
     def values(self, z: Float[np.ndarray, "batch dimension"], k: int) -> Float[np.ndarray, "batch parameters"]:
         """The numbers of term ``k``."""
         return self.parts[0].values(z[:, self.index[0]], k)
