@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 from mjx_fitness import Scores
 
-from mjx_refine.search.landed import PROBING, fitting_width
 from mjx_refine.search.options import Options
 
 GENERATIONS = 80
@@ -36,7 +35,7 @@ class PopulationSearch:
       options: budget, population, seed.
       mean, covariance: of the first generation, unit box.
       start: a point that the first generation contains beside the mean.
-      landed: whether the mean is a good landing, around which the width is fitted first.
+      landed: whether the mean is a good landing.
       evaluations: rollouts spent before.
       part: of what is left of the budget that the search can count on.
 
@@ -65,7 +64,6 @@ class PopulationSearch:
         self.fine = self._refocused = False
         left = options.budget - evaluations
         self._population(self._fitting(int(part * left), POLISHING if landed else GENERATIONS))
-        self._probing = landed and left > PROBING
         self.elites, self._costs = mean[None], np.full(1, np.inf)
         if left < self.population:
             self.reason = LANDED_OUT
@@ -85,11 +83,6 @@ class PopulationSearch:
         """The next points whose costs are wanted; None where the search has ended, ``reason`` then says why."""
         if self.reason is not None:
             return None
-        if self._probing:
-            wanted: list[np.ndarray] = []
-            # Points and costs go by way of a function there: the first call tells which points it wants.
-            fitting_width(lambda p: (wanted.append(p), np.zeros(len(p)))[1], self.mean, self.covariance, self._seed)
-            return wanted[0]
         if self.state is None:
             self.state = mjx_cmaes.init(self.settings, self.mean, covariance=self.covariance, seed=self._seed)
         if self.evaluations + self.population > self.options.budget:
@@ -120,14 +113,6 @@ class PopulationSearch:
         self, points: Float[np.ndarray, "batch dimension"], costs: Float[np.ndarray, "batch"], scores: Scores
     ) -> bool:
         """Takes the costs and scores of what ``points`` returned; True where that was a generation."""
-        if self._probing:
-            width, spent = fitting_width(lambda _: costs, self.mean, self.covariance, self._seed)
-            self.covariance, self.evaluations, self._probing = (
-                width**2 * self.covariance,
-                self.evaluations + spent,
-                False,
-            )
-            return False
         if self.state is None:
             raise RuntimeError("costs of points that nobody asked for")
         self._refocused = False
@@ -163,7 +148,7 @@ class PopulationSearch:
           KeyError, ValueError, TypeError: it is damaged.
         """
         self._population(int(values["population"]))
-        self._probing, self.reason = False, None
+        self.reason = None
         state = {k.removeprefix("cma."): v for k, v in arrays.items() if k.startswith("cma.")}
         self.state = mjx_cmaes.load_state(self.settings, state)
         self.elites, self._costs = arrays["elites"], arrays["elite_costs"]

@@ -12,6 +12,7 @@ from mjx_fitness import Scores
 
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.scene import Scene, Shape
+from mjx_refine.search.aim import aimed
 from mjx_refine.search.checkpoint import damaged, input_digest, load_checkpoint, save_checkpoint
 from mjx_refine.search.derivatives import DerivativeChoice, Derivatives
 from mjx_refine.search.intervals import Intervals, intervals
@@ -200,7 +201,7 @@ class Run:
             best = max(self.landed, key=lambda landed: landed.fitness)
             start = self.problem.starts[best.rank]
             space = Space.around(start.scene)
-            return Beginning(start, space, best.point, first_covariance(best, space))
+            return Beginning(start, space, self._aimed(start, space, best.point), first_covariance(best, space))
         start = self.problem.starts[0]
         space = Space.around(start.scene)
         return Beginning(start, space, space.start, np.diag(space.sigma**2))
@@ -298,6 +299,8 @@ class Run:
         points = [np.clip(p, 0.0, 1.0) for p in points]
         costs = self._full_costs(space, start, np.array(points))
         point = points[int(np.argmin(costs))]
+        candidates = np.stack([point, self._aimed(start, space, point)])
+        point = candidates[int(np.argmin(self._full_costs(space, start, candidates)))]
         known = None
         if self.options.refits:
             self.progress.message(f"{self.options.refits} refits around the solution, for intervals")
@@ -325,6 +328,16 @@ class Run:
             "values": values,
             "known": known,
         }
+
+    def _aimed(self, start: Start, space: Space, point: np.ndarray) -> np.ndarray:
+        """The point as ``aimed`` leaves it, in a hybrid search."""
+        if self.options.optimizer != "hybrid":
+            return point
+        shapes, size = start.scene.shapes, self.problem.observation.size
+        pictures = needs_pictures(batch_with_effects([start.scene]))
+        resolution = search_resolution(self.options, size, self._finer)
+        scorer = self.problem.scorer(shapes, start.matching, resolution, pictures)
+        return aimed(space, point, self.problem.reference(shapes), scorer, self.options.seed)
 
     def _full_costs(self, space: Space, start: Start, points: np.ndarray) -> np.ndarray:
         scores = self.problem.score([space.scene_at(p) for p in points], start.matching)
