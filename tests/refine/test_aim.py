@@ -72,7 +72,8 @@ def test_nobody_leaves_the_box():
     for corner in (np.zeros(space.dimension), np.ones(space.dimension)):
         aim = Aim.of(space, corner)
         ends = corner + np.stack([aim.low, aim.high]) @ aim.columns
-        assert ends.min() > -1e-9 and ends.max() < 1 + 1e-9
+        assert ends.min() > -1e-9
+        assert ends.max() < 1 + 1e-9
 
 
 def test_where_something_stands_in_its_place_only_the_camera_moves():
