@@ -21,6 +21,13 @@ GENERATIONS = 80
 POLISHING = 120
 """The same after a good landing: following one basin takes fewer candidates than finding one."""
 
+STILL, GAIN = 30, 2e-5
+"""Generations without so much gain of fitness after which a search around a good landing begins anew, from its best point:
+contacts make the fitness jagged, and a population that is too wide for them may go astray at once and never come back."""
+
+SPREADS = (0.1, 4.0, 1.0)
+"""Factors on the landing's covariance for new beginnings, in turn."""
+
 ELITES = 8
 """Candidates of the search that are compared at full resolution in the end."""
 
@@ -64,6 +71,7 @@ class PopulationSearch:
         self.fine = self._refocused = False
         left = options.budget - evaluations
         self._population(self._fitting(int(part * left), POLISHING if landed else GENERATIONS))
+        self._landed, self._still, self._beginnings = landed, 0, 0
         self.elites, self._costs = mean[None], np.full(1, np.inf)
         if left < self.population:
             self.reason = LANDED_OUT
@@ -88,16 +96,25 @@ class PopulationSearch:
         if self.evaluations + self.population > self.options.budget:
             self.reason = SPENT
             return None
+        if self._landed and self._still >= STILL:
+            self._begin_anew()
         reason = mjx_cmaes.should_stop(self.settings, self.state)
         if reason is not None:
             self.reason = str(reason)
             return None
         points, self.state = mjx_cmaes.ask(self.settings, self.state)
         if self.state.generation == 0:
-            points = mjx_cmaes.inject(points, np.stack([self.mean, self.start]))
+            first = [self.elites[0]] if self._beginnings else [self.mean, self.start]
+            points = mjx_cmaes.inject(points, np.stack(first))
         elif self._refocused:
             points = mjx_cmaes.inject(points, np.stack([np.clip(self.state.mean, 0, 1), self.elites[0]]))
         return points
+
+    def _begin_anew(self) -> None:
+        covariance = SPREADS[self._beginnings % len(SPREADS)] * self.covariance
+        self._beginnings, self._still = self._beginnings + 1, 0
+        seed = (self._seed + self._beginnings) % 2**32
+        self.state = mjx_cmaes.init(self.settings, self.elites[0], covariance=covariance, seed=seed)
 
     def refocus(self) -> None:
         """From the next generation on, pictures are compared at another resolution: costs so far mean nothing there."""
@@ -118,7 +135,9 @@ class PopulationSearch:
         self._refocused = False
         self.state, _ = mjx_cmaes.tell(self.settings, self.state, points, costs)
         self.evaluations += len(points)
+        before = self._costs.min()
         self.elites, self._costs, best = _merge(self.elites, self._costs, points, costs)
+        self._still = 0 if self._costs.min() < before - GAIN else self._still + 1
         if best is not None:
             self.best = (-float(costs[best]), float(scores.iou[best]), float(scores.epe[best]))
         return True
@@ -139,7 +158,8 @@ class PopulationSearch:
             return None
         arrays = {f"cma.{k}": v for k, v in mjx_cmaes.save_state(self.state).items()}
         arrays.update(elites=self.elites, elite_costs=self._costs)
-        return {"best": self.best, "population": self.population, "fine": self.fine}, arrays
+        values = {"best": self.best, "population": self.population, "fine": self.fine}
+        return {**values, "still": self._still, "beginnings": self._beginnings}, arrays
 
     def restore(self, values: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         """Goes on from what ``saved`` returned.
@@ -153,6 +173,7 @@ class PopulationSearch:
         self.state = mjx_cmaes.load_state(self.settings, state)
         self.elites, self._costs = arrays["elites"], arrays["elite_costs"]
         self.fine = bool(values.get("fine"))
+        self._still, self._beginnings = int(values.get("still", 0)), int(values.get("beginnings", 0))
         fitness, iou, epe = values["best"]
         self.best = (float(fitness), float(iou), float(epe))
 

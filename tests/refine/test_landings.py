@@ -14,7 +14,7 @@ from mjx_refine import Options, refine
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Samples
 from mjx_refine.search.landed import Landed
-from mjx_refine.search.population import PopulationSearch
+from mjx_refine.search.population import STILL, PopulationSearch
 from mjx_refine.search.problem import Problem
 from mjx_refine.search.progress import Progress
 from mjx_refine.search.race import FINE, LEAST, TRIAL, Contender, Race, second_landing
@@ -33,6 +33,30 @@ def test_the_second_landing_is_from_another_sample():
     assert second_landing(poor, LEAST - 1) is None
     assert second_landing(poor[:2], LEAST) is None
     assert second_landing([*poor, landed(3, 0.95)], LEAST) is None
+
+
+def test_a_search_that_stands_still_begins_anew_at_its_best_point_and_so_does_one_that_is_resumed():
+    options = Options(population=16, iterations=80)
+
+    def begun():
+        return PopulationSearch(options, np.full(4, 0.5), 0.04 * np.eye(4), np.full(4, 0.5), True, 0)
+
+    search, resumed, best = begun(), None, []
+    for generation in range(STILL + 3):
+        points = search.points()
+        costs = np.abs(points - 0.5).sum(1) * 10  # the beginning is the best, and all else is far worse
+        if generation == 0:
+            assert (points == 0.5).all(1).any()
+        if resumed is not None:
+            np.testing.assert_array_equal(resumed.points(), points)
+            resumed.told(points, costs, scores(costs))
+        search.told(points, costs, scores(costs))
+        best.append(bool((points == 0.5).all(1).any()))
+        if generation == STILL - 1:
+            resumed = begun()
+            resumed.restore(*search.saved())
+    assert best.index(True, 1) == STILL + 1
+    assert search.elites[0] == pytest.approx(0.5)
 
 
 def race(budget: int = 4000, fine: bool = False) -> Race:
