@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -98,7 +99,7 @@ class Hypothesis:
         """Which coordinates are the base model's."""
         return np.arange(self.dimension) < self.space.dimension
 
-    @property
+    @functools.cached_property
     def tails(self) -> Float[np.ndarray, "dimension"]:
         """Prior widths beyond which moving each coordinate costs ever less; infinite for effects, whose prior is normal."""
         told = [CONTACT_TAIL if p.field in CONTACTS else TAIL for p in self.space.parameters]

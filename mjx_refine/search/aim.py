@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from mjx_refine.sim.backends import Simulator
 from mjx_refine.space import Space
+from mjx_refine.view.grid import GridScorer
 from mjx_refine.view.picture_scorer import PictureScorer
 from mjx_refine.view.tiles import TileScorer
 
@@ -61,7 +62,7 @@ def aimed(
     space: Space,
     point: Float[np.ndarray, "dimension"],
     simulator: Simulator,
-    scorer: TileScorer | PictureScorer,
+    scorer: TileScorer | PictureScorer | GridScorer,
     seed: int,
 ) -> Float[np.ndarray, "dimension"]:
     """The point after a short CMA-ES over ``Aim``; itself where nothing better is seen.

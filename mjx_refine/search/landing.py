@@ -385,7 +385,7 @@ class LeastSquares:
         return step * min(1.0, 3.0 / max(length, 1e-12))
 
 
-def slowed(raw: Float[np.ndarray, "*shape"], scale: float) -> Float[np.ndarray, "*shape"]:
+def slowed(raw: Float[np.ndarray, "*shape"], scale: float | np.ndarray) -> Float[np.ndarray, "*shape"]:
     """Residuals whose squares are Cauchy's loss: as they are below ``scale``, growing ever more slowly beyond."""
     return np.sign(raw) * scale * np.sqrt(np.log1p((raw / scale) ** 2))
 

@@ -297,16 +297,13 @@ class Run:
     def _finish(self, start: Start, space: Space, points: list[np.ndarray], objective: Objective) -> dict:
         """The best of samples, landing and elites at full resolution, by C MuJoCo, as fields of ``Found``."""
         points = [np.clip(p, 0.0, 1.0) for p in points]
-        costs = self._full_costs(space, start, np.array(points))
-        point = points[int(np.argmin(costs))]
-        candidates = np.stack([point, self._aimed(start, space, point)])
-        point = candidates[int(np.argmin(self._full_costs(space, start, candidates)))]
+        point = self._best_of(space, start, points)
+        point = self._best_of(space, start, [point, self._aimed(start, space, point)])
         known = None
         if self.options.refits:
             self.progress.message(f"{self.options.refits} refits around the solution, for intervals")
             known = intervals(self._squares(start, space), point, self.options.refits, self.options.seed)
-            candidates = np.stack([point, known.point])
-            point = candidates[int(np.argmin(self._full_costs(space, start, candidates)))]
+            point = self._best_of(space, start, [point, known.point])
         loose = insensitive(space, point, lambda p: objective(p)[0])
         point = back_to_start(space, point, loose, lambda p: self._full_costs(space, start, p))
         scene = space.scene_at(point)
@@ -333,11 +330,11 @@ class Run:
         """The point as ``aimed`` leaves it, in a hybrid search."""
         if self.options.optimizer != "hybrid":
             return point
-        shapes, size = start.scene.shapes, self.problem.observation.size
-        pictures = needs_pictures(batch_with_effects([start.scene]))
-        resolution = search_resolution(self.options, size, self._finer)
-        scorer = self.problem.scorer(shapes, start.matching, resolution, pictures)
-        return aimed(space, point, self.problem.reference(shapes), scorer, self.options.seed)
+        seen = self._objective(start, space, fine=self._finer)
+        return aimed(space, point, seen.simulator, seen.scorer, self.options.seed)
+
+    def _best_of(self, space: Space, start: Start, points: list[np.ndarray]) -> np.ndarray:
+        return points[int(np.argmin(self._full_costs(space, start, np.stack(points))))]
 
     def _full_costs(self, space: Space, start: Start, points: np.ndarray) -> np.ndarray:
         scores = self.problem.score([space.scene_at(p) for p in points], start.matching)

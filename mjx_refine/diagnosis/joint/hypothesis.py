@@ -103,10 +103,7 @@ class JointHypothesis:
     @functools.cached_property
     def ordinary(self) -> Bool[np.ndarray, "dimension"]:
         """Which coordinates are the base model's."""
-        result = np.empty(self.dimension, bool)
-        for part, index in zip(self.parts, self.index, strict=True):
-            result[index] = part.ordinary
-        return result
+        return np.isfinite(self.tails)
 
     @functools.cached_property
     def tails(self) -> Float[np.ndarray, "dimension"]:
