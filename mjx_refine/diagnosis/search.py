@@ -38,6 +38,10 @@ CLEAR, TOO_QUIET, KEPT = 40.0, 0.35, 6
 """Lead of an effect, and mean square residual that it leaves, from which the noise must have been taken for too large; how
 many effects are fitted again with less."""
 
+SETTLINGS, SETTLED = 8, 0.8
+"""How often the noise is then taken anew from what changes from frame to frame, unless that leaves this part of it: one look
+takes off less than half, and a camera that shakes had made twenty times too much of it."""
+
 FORGIVING = 40.0
 """Scale of the robust loss while a fit is far off [noise widths]."""
 
@@ -219,29 +223,33 @@ def _begin(clip: ClipFit, hypothesis: Hypothesis, base: Fit, lead: Lead, z: np.n
 
 
 def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: dict, names, view: FitView, told: Told) -> None:
-    """An obstacle begins where a push was found: the wall faces along the impulse."""
+    """An obstacle begins where a push was found."""
     if "hidden_obstacle" not in names:
         return
     for (name, target), (fit, promise) in list(fitted.items()):
         if name != "push" or fit.evidence < base.evidence + 3.0:
             continue
-        time, x, y, _ = fit.hypothesis.values(fit.z[None], 0)[0]
-        frame = int(np.clip(round(time * view.fps + 0.25), 0, clip.frames - 1))
-        poses = clip.poses(fit.hypothesis, fit.z[None])[0]
-        if not np.isfinite(poses).all():
-            continue
-        there = dataclasses.replace(view, poses=poses)
-        start = HiddenObstacle().facing(there, target, frame, float(np.degrees(np.arctan2(y, x))))
         told("hidden_obstacle")
-        lead = Lead(
-            "hidden_obstacle", target, dataclasses.replace(start, places=clip.frames), promise, np.zeros(0), base.z * 0
-        )
-        one = term_of(lead.name, target, lead.start, clip.frames)
-        z = np.concatenate([fit.z[: base.hypothesis.dimension], np.zeros(int(one.free.sum()))])
-        wall = clip.fit(base.hypothesis.added(one), z, 9)
-        key = (lead.name, target)
-        if key not in fitted or wall.evidence > fitted[key][0].evidence:
+        wall = _wall_from_push(clip, fit, view)
+        key = ("hidden_obstacle", target)
+        if wall is not None and (key not in fitted or wall.evidence > fitted[key][0].evidence):
             fitted[key] = (wall, promise)
+
+
+def _wall_from_push(clip: ClipFit, fit: Fit, view: FitView) -> Fit | None:
+    """The fit with an obstacle in the place of its last effect, a push: the wall faces along the impulse."""
+    *others, push = fit.hypothesis.terms
+    rest = dataclasses.replace(fit.hypothesis, terms=tuple(others))
+    time, x, y, _ = fit.hypothesis.values(fit.z[None], len(others))[0]
+    frame = int(np.clip(round(time * view.fps + 0.25), 0, clip.frames - 1))
+    poses = clip.poses(fit.hypothesis, fit.z[None])[0]
+    if not np.isfinite(poses).all():
+        return None
+    there = dataclasses.replace(view, poses=poses)
+    start = HiddenObstacle().facing(there, push.target, frame, float(np.degrees(np.arctan2(y, x))))
+    one = term_of("hidden_obstacle", push.target, dataclasses.replace(start, places=clip.frames), clip.frames)
+    z = np.concatenate([fit.z[: rest.dimension], np.zeros(int(one.free.sum()))])
+    return clip.fit(rest.added(one), z, 9)
 
 
 def _pairs(clip: ClipFit, base: Fit, singles, names, observation, masks_of, told: Told) -> tuple[Candidate, ...]:
@@ -255,13 +263,19 @@ def _pairs(clip: ClipFit, base: Fit, singles, names, observation, masks_of, told
             [n for n in names if n not in first.names or catalogue()[n].targeted]
         )
         leads = [x for x in leads if (x.name, x.target) not in set(zip(first.names, first.targets, strict=True))]
-        chosen = [x for x in chosen_of(leads, 3) if x.gain > SECOND_PROMISE][:3]
+        # Three effects, not three moments of one push.
+        chosen = [x for x in chosen_of(leads, 3, 1) if x.gain > SECOND_PROMISE]
         for lead in chosen:
             told(f"{first.names[0]} and {lead.name}")
             one = lead.term(clip.frames)
             hypothesis = first.fit.hypothesis.added(one)
             fit = clip.fit(hypothesis, _begin(clip, hypothesis, first.fit, lead, lead.z(one)), 7)
             found.append(Candidate(fit, _lead(fit, base), lead.gain))
+            if lead.name == "push" and "hidden_obstacle" in names and found[-1].lead > first.lead:
+                told(f"{first.names[0]} and hidden_obstacle")
+                wall = _wall_from_push(clip, fit, view)
+                if wall is not None:
+                    found.append(Candidate(wall, _lead(wall, base), lead.gain))
     return tuple(sorted(found, key=lambda c: -c.lead))
 
 
@@ -269,8 +283,14 @@ def _again(
     clip: ClipFit, base: Fit, singles: tuple[Candidate, ...], seed: int
 ) -> tuple[Fit, tuple[Candidate, ...], int]:
     """All fits once more with the noise that the best effect leaves: what it explains had been taken for noise before."""
-    clip.settle_noise(singles[0].fit)
-    clip.allow_chaos(base, seed)
+    best = singles[0].fit
+    for _ in range(SETTLINGS):
+        taken = clip.measured.moment_noise
+        clip.settle_noise(best)
+        best = clip.at(best.hypothesis, best.z)
+        if np.all(clip.measured.moment_noise > SETTLED * taken):
+            break
+    clip.allow_chaos(best, seed)
     impacts = clip.allow_slack(base)
     base = clip.fit(base.hypothesis, base.z, 10)
     found = []
