@@ -13,6 +13,7 @@ from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import HeldOut, held_out
 from mjx_refine.diagnosis.hypothesis import Term
 from mjx_refine.diagnosis.measure import Measured, measure
+from mjx_refine.diagnosis.replay import replays
 from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Value, Verdict
 from mjx_refine.diagnosis.search import Candidate, Compared, compare, view_of
 from mjx_refine.diagnosis.store import Store
@@ -183,29 +184,31 @@ def _result(
         outside = held_out(clip, base, best.fit)
     if best is None:
         outside = dataclasses.replace(outside, after=outside.before)
-    before_scene = base.hypothesis.scene(base.z, clip.frames)
-    after_scene = shown.hypothesis.scene(shown.z, clip.frames)
-    scores = [problem.score([s], matching) for s in (before_scene, after_scene)]
     view = view_of(clip, shown, observation, matching, hidden=False)
-    channels = misfit_map(clip, base)[1]
-    gap = _gap(outside, scores, seed)
+    told = {
+        "where": places(clip, base, best.fit if best else None, view),
+        "candidates": tuple(ranked(clip, compared, said, outside, best)),
+        "residual": describe(clip, base, view_of(clip, base, observation, matching, hidden=False)),
+        "remaining": describe(clip, shown, view),
+        "map_before": map_of(clip, base),
+        "map_after": map_of(clip, shown),
+        "channels": misfit_map(clip, base)[1],
+        "notes": _notes(clip, compared, matching, names),
+    }
+    # From here on contacts may not err.
+    fits = [base] if best is None else [base, best.fit]
+    scenes = replays(clip, fits, lambda some: problem.score(some, matching).fitness)
+    scores = [problem.score([scene], matching) for scene in (scenes[0], scenes[-1])]
     return Diagnosis(
         verdict=verdict,
-        gap=gap,
-        where=places(clip, base, best.fit if best else None, view),
-        candidates=tuple(ranked(clip, compared, said, outside, best)),
-        residual=describe(clip, base, view_of(clip, base, observation, matching, hidden=False)),
-        remaining=describe(clip, shown, view),
-        base=before_scene,
-        scene=after_scene,
+        gap=_gap(outside, scores, seed),
+        base=scenes[0],
+        scene=scenes[-1],
         matching=matching,
-        map_before=map_of(clip, base),
-        map_after=map_of(clip, shown),
-        channels=channels,
-        notes=_notes(clip, compared, matching, names),
         signs=dataclasses.asdict(found),
         seconds=time.monotonic() - began,
         rollouts=int(clip.rollouts),
+        **told,
     )
 
 
