@@ -71,7 +71,7 @@ def diagnose(
     told("held-out frames")
     best = best_candidate(compared)
     outside = held_out(clip, compared.base, best.fit if best else None)
-    found = signs(clip, compared, outside.gain)
+    found = signs(clip, compared, outside.gain, outside.closed)
     leads = [c.lead for c in compared.candidates]
     said = answer(found, leads)
     told("report")

@@ -25,6 +25,7 @@ class Signs:
       structure_after: ditto of the best hypothesis'.
       held_out: gain on held-out frames of the best hypothesis over the base model, in the same units.
       whole: mean square residual, background included, where no effect leads by much; otherwise 1.
+      closed: part of the gap on held-out frames that the best hypothesis closes; 1 where that is not asked.
     """
 
     lead: float
@@ -36,9 +37,10 @@ class Signs:
     structure_after: float
     held_out: float
     whole: float
+    closed: float = 1.0
 
 
-def signs(clip: ClipFit, compared: Compared, held_out: float) -> Signs:
+def signs(clip: ClipFit, compared: Compared, held_out: float, closed: float = 1.0) -> Signs:
     """Reads the signs off all fits."""
     singles, pairs = compared.candidates, compared.pairs
     best = best_candidate(compared)
@@ -57,6 +59,7 @@ def signs(clip: ClipFit, compared: Compared, held_out: float) -> Signs:
         structure_after=structure(clip, after),
         held_out=held_out / unit,
         whole=1.0 if first and first.lead / unit >= LITTLE else 2 * compared.base.data / clip.expected(),
+        closed=closed,
     )
 
 
@@ -105,6 +108,9 @@ QUIET, QUIETLY_NAMED = 1.3, 100.0
 ODD, RESTLESS = 3.0, 2.5
 """Structure of the residuals, and their mean square, from which something is missing though no effect leads."""
 
+CLOSES = 0.1
+"""Part of the gap on frames that no fit has seen which what is named must close: else it merely bends with the frames seen."""
+
 STRANGE, CLEAR = 1.3, 150.0
 """Structure of the residuals above which the named effect is not what, or not all that, is missing; the margin over the next
 effect that lets twice as much be left."""
@@ -147,6 +153,8 @@ def answer(told: Signs, leads: list[float]) -> Answer:
             return Answer("unknown", RIGHT_UNKNOWN, shares)
         lead = np.log1p(max(told.lead, 0.0) / 5)
         return Answer("none", _logistic(RIGHT_NONE["constant"] + RIGHT_NONE["lead"] * lead), shares)
+    if told.closed < CLOSES:
+        return Answer("unknown", RIGHT_UNKNOWN, shares)
     if told.pair > max(PAIRED, PART_PAIRED * told.lead):
         return Answer("pair", RIGHT_PAIR, shares)
     if told.structure_after > STRANGE * (1 + max(told.margin, 0.0) / CLEAR):

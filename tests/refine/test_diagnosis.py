@@ -103,6 +103,9 @@ SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
         ({"lead": 5.0, "whole": 9.0}, "unknown"),
         ({"structure_after": 40.0, "after": 5.0}, "unknown"),
         ({"pair": 200.0}, "pair"),
+        ({"closed": 0.05}, "unknown"),
+        ({"closed": 0.05, "pair": 200.0}, "unknown"),
+        ({"closed": 0.05, "lead": 20.0}, "none"),
     ],
 )
 def test_the_answer_follows_the_signs(changes, kind):
