@@ -13,7 +13,7 @@ from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import HeldOut, held_out
 from mjx_refine.diagnosis.hypothesis import Term
 from mjx_refine.diagnosis.measure import Measured, measure
-from mjx_refine.diagnosis.replay import replays
+from mjx_refine.diagnosis.replay import Replay, replays
 from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Value, Verdict
 from mjx_refine.diagnosis.search import Candidate, Compared, compare, view_of
 from mjx_refine.diagnosis.store import Store
@@ -185,38 +185,38 @@ def _result(
     if best is None:
         outside = dataclasses.replace(outside, after=outside.before)
     view = view_of(clip, shown, observation, matching, hidden=False)
-    told = {
-        "where": places(clip, base, best.fit if best else None, view),
-        "candidates": tuple(ranked(clip, compared, said, outside, best)),
-        "residual": describe(clip, base, view_of(clip, base, observation, matching, hidden=False)),
-        "remaining": describe(clip, shown, view),
-        "map_before": map_of(clip, base),
-        "map_after": map_of(clip, shown),
-        "channels": misfit_map(clip, base)[1],
-        "notes": _notes(clip, compared, matching, names),
-    }
+    where = places(clip, base, best.fit if best else None, view)
+    candidates = tuple(ranked(clip, compared, said, outside, best))
+    residual = describe(clip, base, view_of(clip, base, observation, matching, hidden=False))
+    remaining = describe(clip, shown, view)
+    map_before, map_after, channels = map_of(clip, base), map_of(clip, shown), misfit_map(clip, base)[1]
     # From here on contacts may not err.
     fits = [base] if best is None else [base, best.fit]
-    scenes = replays(clip, fits, lambda some: problem.score(some, matching).fitness)
-    scores = [problem.score([scene], matching) for scene in (scenes[0], scenes[-1])]
+    found_scenes = replays(clip, fits, problem, matching)
+    before, after = found_scenes[0], found_scenes[-1]
     return Diagnosis(
         verdict=verdict,
-        gap=_gap(outside, scores, seed),
-        base=scenes[0],
-        scene=scenes[-1],
+        gap=_gap(outside, before, after, seed),
+        where=where,
+        candidates=candidates,
+        residual=residual,
+        remaining=remaining,
+        base=before.scene,
+        scene=after.scene,
         matching=matching,
+        map_before=map_before,
+        map_after=map_after,
+        channels=channels,
+        notes=_notes(clip, compared, matching, names),
         signs=dataclasses.asdict(found),
         seconds=time.monotonic() - began,
         rollouts=int(clip.rollouts),
-        **told,
     )
 
 
-def _gap(outside: HeldOut, scores, seed: int) -> Gap:
+def _gap(outside: HeldOut, first: Replay, last: Replay, seed: int) -> Gap:
     before, after = (float(np.sqrt(np.mean(v**2))) for v in (outside.before, outside.after))
     low, high = outside.interval(seed)
-    iou = [float(s.iou[0]) for s in scores]
-    epe = [float(s.epe[0]) for s in scores]
     return Gap(
         metric="centroids, outlines, flow, background against the clip, root mean square over held-out frames, in noise widths",
         held_out="every third block of three frames",
@@ -226,10 +226,10 @@ def _gap(outside: HeldOut, scores, seed: int) -> Gap:
         closed=outside.closed,
         closed_low=low,
         closed_high=high,
-        iou_before=iou[0],
-        iou_after=iou[1],
-        epe_before=epe[0],
-        epe_after=epe[1],
+        iou_before=first.iou,
+        iou_after=last.iou,
+        epe_before=first.epe,
+        epe_after=last.epe,
     )
 
 

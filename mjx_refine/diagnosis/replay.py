@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 
@@ -11,14 +10,22 @@ from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.noise import everywhere
 from mjx_refine.scene import Scene
+from mjx_refine.search.problem import Problem
 
 ITERATIONS = 8
-
-Scored = Callable[[list[Scene]], np.ndarray]
-"""Fitness (IoU - EPE) of scenes of one kind with the same effects."""
+"""Of least squares: it begins where the fit with erring contacts ended."""
 
 
-def replays(clip: ClipFit, fits: list[Fit], scored: Scored) -> list[Scene]:
+@dataclasses.dataclass(frozen=True)
+class Replay:
+    """A scene, its mean IoU over the clip, and its end-point error [px]."""
+
+    scene: Scene
+    iou: float
+    epe: float
+
+
+def replays(clip: ClipFit, fits: list[Fit], problem: Problem, matching: tuple[int, ...]) -> list[Replay]:
     """For each fit the scene that replays the clip best, its effects as they were fitted; afterwards contacts may not err.
 
     Least squares goes on over the base parameters alone; what it finds, where it began, and the scene that was given with
@@ -27,18 +34,21 @@ def replays(clip: ClipFit, fits: list[Fit], scored: Scored) -> list[Scene]:
     Args:
       clip: its slack is forgotten.
       fits: base model and diagnosed one.
-      scored: compares them.
+      problem: scores them, by C MuJoCo at full resolution.
+      matching: mask id of each object.
     """
     clip.forget_slack(everywhere(clip.measured, clip.frames))
-    return [_replay(clip, fit, scored) for fit in fits]
+    return [_replay(clip, fit, problem, matching) for fit in fits]
 
 
-def _replay(clip: ClipFit, fit: Fit, scored: Scored) -> Scene:
+def _replay(clip: ClipFit, fit: Fit, problem: Problem, matching: tuple[int, ...]) -> Replay:
     held = _held(fit)
     here, given = fit.z[: held.dimension], np.zeros(held.dimension)
     rigid = clip.fit(held, here, ITERATIONS).z
     scenes = [held.scene(z, clip.frames) for z in (rigid, here, given)]
-    return scenes[int(np.argmax(np.nan_to_num(scored(scenes), nan=-np.inf)))]
+    scores = problem.score(scenes, matching)
+    best = int(np.argmax(np.nan_to_num(scores.fitness, nan=-np.inf)))
+    return Replay(scenes[best], float(scores.iou[best]), float(scores.epe[best]))
 
 
 def _held(fit: Fit) -> Hypothesis:
