@@ -10,12 +10,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mjx_refine.batch import SceneBatch
+from mjx_refine.diagnosis.chaos import believed, drawn, jaggedness
 from mjx_refine.diagnosis.fitted import Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, settled
-from mjx_refine.diagnosis.pace import DAMPINGS, STEPS, Pace
+from mjx_refine.diagnosis.pace import DAMPINGS, STEPS, Pace, damped, updated
 from mjx_refine.diagnosis.predict import Prediction, Predictor
+from mjx_refine.diagnosis.roam import GENERATIONS, ROAMED, Strategy
 from mjx_refine.diagnosis.slack import BIAS, Slack, impacts, kicked, slack_of, sustained, touching
 from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
 from mjx_refine.search.landing import slowed
@@ -27,9 +29,9 @@ SCALE = 5.0
 PATIENCE = Parts(1.0, 1.0, 6.0, 1.0)
 """The same for each kind of measurement, in multiples: a centroid is either of the whole mask or not measured at all."""
 
-
-DRAWS = 12
-"""Pairs of rollouts that measure chaos."""
+WORTH, LITTLE_GAIN = 0.3, 0.002
+"""A step by derivatives that were only updated is followed by another where it gains this part of the step before, and this
+part of the cost."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,29 +165,22 @@ class ClipFit:
         self.noise = everywhere(self.measured, self.frames)
 
     def allow_chaos(self, fit: Fit, seed: int) -> None:
-        """Adds the rollout's own jaggedness around a fit to the noise.
+        """Adds the rollout's own jaggedness around a fit to the noise, as far as the fit leaves something of it.
 
         After contacts the paths of bodies jump with the smallest change of a parameter. Of three rollouts on a line, two
         of them a posterior standard deviation to either side, the second difference is what no least squares can follow.
         """
-        generator = np.random.default_rng(seed)
-        factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
-        steps = generator.standard_normal((DRAWS, len(fit.z))) @ factor
         low, high = fit.hypothesis.bounds
-        z = np.clip(np.concatenate([fit.z + steps, fit.z - steps, fit.z[None]]), low, high)
+        z = np.clip(drawn(fit.z, fit.curvature, seed), low, high)
         told = self.predictor(self.poses(fit.hypothesis, z), fit.hypothesis.batch(z))
-
-        def bend(values: np.ndarray) -> np.ndarray:
-            second = values[:DRAWS] + values[DRAWS:-1] - 2 * values[-1:]
-            square = np.nan_to_num(np.where(told.bad[:DRAWS].reshape(-1, *(1,) * (second.ndim - 1)), 0.0, second)) ** 2
-            return np.sqrt(np.median(square.reshape(*square.shape[:3], -1).mean(-1), axis=0) / 2.0)
-
-        m = self.measured
-        second = np.stack([bend(told.moments[..., k : k + 1]) for k in range(3)], -1)
+        white = self.measured.split(self.residuals(fit.hypothesis, fit.z[None])[0][0])
+        counts = self.counts.of(self.measured.parts)
+        left = Parts(*(w * sigma / np.sqrt(c) for w, sigma, c in zip(white, self.widths, counts, strict=True)))
+        chaos, m = believed(jaggedness(told), left), self.measured
         self.noise = Noise(
-            np.hypot(m.edge_noise, bend(told.reach)),
-            np.hypot(m.flow_noise, bend(told.flow)),
-            np.hypot(m.moment_noise, second),
+            np.hypot(m.edge_noise, chaos.reach),
+            np.hypot(m.flow_noise, chaos.flow),
+            np.hypot(m.moment_noise, chaos.moments),
             self.noise.background,
         )
 
@@ -308,21 +303,29 @@ class ClipFit:
         base, costs = self.residuals(hypothesis, z[None], keep, scale)
         base, cost = base[0], float(costs[0])
         pace = Pace()
-        jacobian = self.jacobian(hypothesis, z, base, keep, scale, pace.size)
-        for _ in range(iterations):
+        jacobian, fresh, usual = self.jacobian(hypothesis, z, base, keep, scale, pace.size), True, 0.0
+        while iterations > 0:
             price, slope = prior(hypothesis, z)
             gradient = jacobian.T @ base + slope * price
             curvature = jacobian.T @ jacobian + np.diag(slope**2)
-            trials = np.array([self._step(z, gradient, curvature, f, low, high) for f in DAMPINGS * pace.damping])
+            trials = np.array([damped(z, gradient, curvature, f, low, high) for f in DAMPINGS * pace.damping])
             moved, costs = self.residuals(hypothesis, trials, keep, scale)
             best = int(np.argmin(costs))
             gain = cost - float(costs[best])
+            step, change = trials[best] - z, moved[best] - base
             if gain > 0:
                 z, base, cost = trials[best], moved[best], float(costs[best])
-            if pace.done(gain, best, cost):
-                break
-            if gain > 0 or pace.failed:
-                jacobian = self.jacobian(hypothesis, z, base, keep, scale, pace.size)
+            worth = gain >= max(WORTH * usual, LITTLE_GAIN * cost, 0.05)
+            if fresh or worth:
+                iterations -= 1
+                if pace.done(gain, best, cost):
+                    break
+            if worth and pace.failed == 0:
+                jacobian, fresh, usual = updated(jacobian, step, change), False, gain
+            elif gain > 0 or pace.failed or not fresh:
+                jacobian, fresh, usual = self.jacobian(hypothesis, z, base, keep, scale, pace.size), True, 0.0
+        if pace.size != STEPS[0] or not fresh:
+            jacobian = self.jacobian(hypothesis, z, base, keep, scale)
         if pace.size != STEPS[0]:
             jacobian = self.jacobian(hypothesis, z, base, keep, scale)
         return self._finished(hypothesis, z, base, jacobian)
@@ -356,14 +359,31 @@ class ClipFit:
                 fit = trial
         return fit
 
-    def _step(self, z, gradient, curvature, factor, low, high) -> np.ndarray:
-        free = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
-        step = np.zeros(len(z))
-        matrix = curvature[np.ix_(free, free)]
-        matrix = matrix + factor * np.diag(np.maximum(0.01 * np.diag(matrix), 1.0))
-        step[free] = -np.linalg.solve(matrix, gradient[free])
-        step *= min(1.0, 12.0 / max(np.abs(step).max(initial=0.0), 1e-12))
-        return np.clip(z + step, low, high)
+    @remembered
+    def roam(self, fit: Fit, seed: int, widths: tuple[float, ...] = ROAMED, keep=None) -> Fit:
+        """Least squares again from where an evolution strategy ends that begins at a fit, in its posterior's coordinates.
+
+        Args:
+          fit: where to begin.
+          seed: of the draws.
+          widths: of the first generation in each round [posterior standard deviations].
+          keep: frames that count.
+        """
+        for width in widths:
+            factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
+            low, high = fit.hypothesis.bounds
+            best, point = fit.cost, fit.z
+            strategy = Strategy(len(fit.z), width, seed)
+            for _ in range(GENERATIONS):
+                points = np.clip(fit.z + strategy.ask() @ factor, low, high)
+                costs = self.residuals(fit.hypothesis, points, keep)[1]
+                if np.min(costs) < best:
+                    best, point = float(np.min(costs)), points[int(np.argmin(costs))]
+                strategy.tell(costs)
+            if best < fit.cost:
+                trial = self.fit(fit.hypothesis, point, 8, keep)
+                fit = trial if trial.cost < fit.cost else fit
+        return fit
 
     def _finished(self, hypothesis: Hypothesis, z, base, jacobian) -> Fit:
         data = 0.5 * float(base @ base)

@@ -3,12 +3,40 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
 STEPS = (0.002, 0.02, 0.2)
 """Of finite differences, in prior widths: the first follows what is smooth, the others see over the jags of contacts, and
 are tried where it leads no further."""
 
 DAMPINGS = np.array([0.03, 0.3, 1.0, 10.0, 100.0])
+
+
+def damped(
+    z: Float[np.ndarray, "dimension"],
+    gradient: Float[np.ndarray, "dimension"],
+    curvature: Float[np.ndarray, "dimension dimension"],
+    factor: float,
+    low: Float[np.ndarray, "dimension"],
+    high: Float[np.ndarray, "dimension"],
+) -> Float[np.ndarray, "dimension"]:
+    """Where a damped step leads within the bounds (Marquardt 1963)."""
+    free = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
+    step = np.zeros(len(z))
+    matrix = curvature[np.ix_(free, free)]
+    matrix = matrix + factor * np.diag(np.maximum(0.01 * np.diag(matrix), 1.0))
+    step[free] = -np.linalg.solve(matrix, gradient[free])
+    step *= min(1.0, 12.0 / max(np.abs(step).max(initial=0.0), 1e-12))
+    return np.clip(z + step, low, high)
+
+
+def updated(
+    jacobian: Float[np.ndarray, "residuals dimension"],
+    step: Float[np.ndarray, "dimension"],
+    change: Float[np.ndarray, "residuals"],
+) -> Float[np.ndarray, "residuals dimension"]:
+    """The derivatives with the least change that makes them predict what a step did (Broyden 1965)."""
+    return jacobian + np.outer(change - jacobian @ step, step) / max(float(step @ step), 1e-12)
 
 
 class Pace:

@@ -10,8 +10,10 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from mjx_refine.diagnosis.base import base_space, stored_base
+from mjx_refine.diagnosis.exchange import exchanged
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.fitted import Explained
+from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen, term_of
 from mjx_refine.diagnosis.slack import spins, touching
 from mjx_refine.effects import catalogue
@@ -31,8 +33,8 @@ FRESH = 6
 DOUBT = {"friction_patch": 30.0}
 """Lead that is taken off: no two engines slow bodies down alike, and a patch can imitate much of that."""
 
-RIVALS = 4
-"""Runners-up that are fitted again from where the best effect's fit ended."""
+ROAMING, HOPELESS = 2, -30.0
+"""How many effects' fits look beyond where least squares ended, and the lead below which none does."""
 
 CLEAR, TOO_QUIET, KEPT = 40.0, 0.35, 6
 """Lead of an effect, and mean square residual that it leaves, from which the noise must have been taken for too large; how
@@ -114,23 +116,23 @@ def compare(
     clip.allow_chaos(base, seed)
     impacts = clip.allow_slack(base)
     base = clip.fit(base.hypothesis, base.z, 10)
-    base = clip.hop(base, seed, 2)
+    base = clip.roam(base, seed)
     # With slack the fit is closer, and so is what it says of the noise.
     clip.settle_noise(base)
     clip.allow_chaos(base, seed)
     impacts = clip.allow_slack(base)
     base = clip.fit(base.hypothesis, base.z, 10)
     names = [name for name in catalogue() if name not in without]
-    base, singles = _singles(clip, base, names, scene, observation, masks_of, told)
+    base, singles = _singles(clip, base, names, scene, observation, masks_of, seed, told)
     if singles and singles[0].lead > CLEAR and clip.misfit(singles[0].fit) < TOO_QUIET:
         told("noise, once more")
         base, singles, impacts = _again(clip, base, singles, seed)
-    pairs = _pairs(clip, base, singles, names, observation, masks_of, told)
+    pairs = _pairs(clip, base, singles, names, observation, masks_of, seed, told)
     return Compared(base, singles, pairs, impacts)
 
 
 def _singles(
-    clip: ClipFit, base: Fit, names, scene, observation, masks_of, told: Told
+    clip: ClipFit, base: Fit, names, scene, observation, masks_of, seed: int, told: Told
 ) -> tuple[Fit, tuple[Candidate, ...]]:
     fitted: dict[tuple[str, int], tuple[Fit, float]] = {}
     zero = clip.at(base.hypothesis, np.zeros(base.hypothesis.dimension), scale=FORGIVING)
@@ -154,38 +156,19 @@ def _singles(
         if other.cost > base.cost - 1.0:
             break
         base = other
-    _from_the_best(clip, base, fitted)
+    base, fitted = exchanged(clip, base, fitted)
+    for key in sorted(fitted, key=lambda key: -fitted[key][0].evidence)[:ROAMING]:
+        fit, promise = fitted[key]
+        if _lead(fit, base) > HOPELESS:
+            fitted[key] = (clip.roam(clip.fit(fit.hypothesis, fit.z, 8), seed, ROAMED_AGAIN), promise)
+    base, fitted = exchanged(clip, base, fitted)
     finals = [Candidate(fit, _lead(fit, base), promise) for fit, promise in fitted.values()]
-    finals.sort(key=lambda c: -c.lead)
-    finals = [_polished(clip, c, base) for c in finals[:2]] + finals[2:]
     return base, tuple(sorted(finals, key=lambda c: -c.lead))
 
 
 def _lead(fit: Fit, base: Fit) -> float:
     """Of a fit's evidence over the base model's."""
     return fit.evidence - base.evidence - sum(DOUBT.get(t.name, 0.0) for t in fit.hypothesis.terms)
-
-
-def _from_the_best(clip: ClipFit, base: Fit, fitted: dict) -> None:
-    """Runners-up once more from the base parameters that the best effect's fit found: one basin is fair to all."""
-    ordered = sorted(fitted, key=lambda key: -fitted[key][0].evidence)
-    best = fitted[ordered[0]][0] if ordered else base
-    count = base.hypothesis.dimension
-    for key in ordered[1 : 1 + RIVALS]:
-        fit, promise = fitted[key]
-        if fit.evidence < base.evidence + 0.1 * (best.evidence - base.evidence):
-            break
-        again = clip.fit(fit.hypothesis, np.concatenate([best.z[:count], fit.z[count:]]), 8)
-        if again.evidence > fit.evidence:
-            fitted[key] = (again, promise)
-
-
-def _polished(clip: ClipFit, candidate: Candidate, base: Fit) -> Candidate:
-    if candidate.lead < 0:
-        return candidate
-    fit = clip.fit(candidate.fit.hypothesis, candidate.fit.z, 8)
-    fit = clip.hop(fit if fit.cost < candidate.fit.cost else candidate.fit, 1, 1)
-    return dataclasses.replace(candidate, fit=fit, lead=_lead(fit, base))
 
 
 def chosen_of(leads: list[Lead], families: int, starts: int = 2) -> list[Lead]:
@@ -252,7 +235,9 @@ def _wall_from_push(clip: ClipFit, fit: Fit, view: FitView) -> Fit | None:
     return clip.fit(rest.added(one), z, 9)
 
 
-def _pairs(clip: ClipFit, base: Fit, singles, names, observation, masks_of, told: Told) -> tuple[Candidate, ...]:
+def _pairs(
+    clip: ClipFit, base: Fit, singles, names, observation, masks_of, seed: int, told: Told
+) -> tuple[Candidate, ...]:
     """Forward selection of a second effect beside the best one or two."""
     found: list[Candidate] = []
     for first in singles[:2]:
@@ -276,7 +261,11 @@ def _pairs(clip: ClipFit, base: Fit, singles, names, observation, masks_of, told
                 wall = _wall_from_push(clip, fit, view)
                 if wall is not None:
                     found.append(Candidate(wall, _lead(wall, base), lead.gain))
-    return tuple(sorted(found, key=lambda c: -c.lead))
+    found.sort(key=lambda c: -c.lead)
+    if found and found[0].lead > singles[0].lead:
+        fit = clip.roam(found[0].fit, seed, ROAMED_AGAIN)
+        found[0] = dataclasses.replace(found[0], fit=fit, lead=_lead(fit, base))
+    return tuple(found)
 
 
 def _again(

@@ -102,7 +102,7 @@ LITTLE = 15.0
 NAMED = 30.0
 """Lead from which something is said to be missing: what two engines differ by stays below it."""
 
-QUIET, QUIETLY_NAMED = 1.3, 100.0
+QUIET, QUIETLY_NAMED = 1.3, 55.0
 """Structure of the base model's residuals below which they look like noise, and the lead that is then asked for."""
 
 ODD, RESTLESS = 3.0, 2.5

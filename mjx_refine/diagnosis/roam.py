@@ -1,0 +1,54 @@
+"""A small evolution strategy that looks around the end of a least squares fit, over the jags that contacts leave."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+OFFSPRING = 40
+"""Of a generation."""
+
+GENERATIONS = 16
+"""Of a round."""
+
+ROAMED, ROAMED_AGAIN = (1.0, 4.0), (2.0,)
+"""Widths of the first generation in each round, of the base model's fit and of effects' [posterior standard deviations]."""
+
+
+class Strategy:
+    """Weighted recombination with a path that sets the step (Hansen and Ostermeier 2001, CSA-ES), in coordinates in which
+    the posterior is round: there is no time to learn a covariance, and the fit tells one.
+
+    Args:
+      dimension: of the points, which are distances from the fit.
+      width: of the first generation.
+      seed: of the draws.
+    """
+
+    def __init__(self, dimension: int, width: float, seed: int):
+        self._generator = np.random.default_rng(seed)
+        self._width, self._mean, self._path = width, np.zeros(dimension), np.zeros(dimension)
+        parents = OFFSPRING // 2
+        weights = np.log(parents + 0.5) - np.log(np.arange(1, parents + 1))
+        self._weights = weights / weights.sum()
+        mass = 1.0 / float((self._weights**2).sum())
+        self._rate = (mass + 2) / (dimension + mass + 5)
+        self._damping = 1 + self._rate + 2 * max(0.0, np.sqrt((mass - 1) / (dimension + 1)) - 1)
+        self._kick = np.sqrt(self._rate * (2 - self._rate) * mass)
+        self._length = np.sqrt(dimension) * (1 - 1 / (4 * dimension) + 1 / (21 * dimension**2))
+        self._drawn = np.zeros((OFFSPRING, dimension))
+
+    def ask(self) -> Float[np.ndarray, "offspring dimension"]:
+        """The next generation."""
+        half = self._generator.standard_normal((OFFSPRING // 2, len(self._mean)))
+        self._drawn = np.concatenate([half, -half])
+        return self._mean + self._width * self._drawn
+
+    def tell(self, costs: Float[np.ndarray, "offspring"]) -> None:
+        """What each of the last generation costs; infinite where it diverged."""
+        best = np.argsort(costs, kind="stable")[: len(self._weights)]
+        step = self._weights @ self._drawn[best]
+        self._mean = self._mean + self._width * step
+        self._path = (1 - self._rate) * self._path + self._kick * step
+        grown = float(np.linalg.norm(self._path)) / self._length - 1
+        self._width *= float(np.exp(min(self._rate / self._damping * grown, 1.0)))
