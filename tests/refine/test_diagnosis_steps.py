@@ -1,0 +1,130 @@
+"""How a diagnosis' fits step, look around their ends, share base parameters, and what of chaos they believe."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+
+from mjx_refine.diagnosis.chaos import DRAWS, EXCUSED, believed, drawn, jaggedness
+from mjx_refine.diagnosis.exchange import exchanged
+from mjx_refine.diagnosis.fitted import Fit
+from mjx_refine.diagnosis.measure import Parts
+from mjx_refine.diagnosis.pace import damped, updated
+from mjx_refine.diagnosis.roam import Strategy
+
+RNG = np.random.default_rng(0)
+
+
+def test_updated_derivatives_predict_the_step_and_change_nothing_across_it():
+    jacobian, step, change = RNG.normal(size=(7, 3)), RNG.normal(size=3), RNG.normal(size=7)
+    new = updated(jacobian, step, change)
+    across = np.cross(step, [0.3, -0.2, 0.9])
+    assert np.allclose(new @ step, change)
+    assert np.allclose(new @ across, jacobian @ across)
+
+
+def test_a_step_of_length_zero_leaves_the_derivatives():
+    jacobian = RNG.normal(size=(7, 3))
+    assert np.array_equal(updated(jacobian, np.zeros(3), np.zeros(7)), jacobian)
+
+
+def test_an_undamped_step_ends_at_the_bottom_and_within_the_bounds():
+    jacobian, target = RNG.normal(size=(9, 3)), np.array([0.5, -1.0, 2.0])
+    curvature, gradient = jacobian.T @ jacobian, -jacobian.T @ jacobian @ target
+    wide = damped(np.zeros(3), gradient, curvature, 1e-9, -np.full(3, 10.0), np.full(3, 10.0))
+    narrow = damped(np.zeros(3), gradient, curvature, 1e-9, -np.full(3, 10.0), np.full(3, 1.5))
+    assert np.allclose(wide, target, atol=1e-5)
+    assert np.allclose(narrow, [0.5, -1.0, 1.5], atol=1e-5)
+
+
+def _ended(seed: int, jag: float) -> float:
+    strategy, best = Strategy(12, 2.0, seed), np.inf
+    goal = np.full(12, 1.5)
+    for _ in range(60):
+        points = strategy.ask()
+        costs = ((points - goal) ** 2).sum(1) + jag * np.sin(40 * points).sum(1) ** 2
+        best = min(best, float(costs.min()))
+        strategy.tell(costs)
+    return best
+
+
+def test_the_strategy_descends_also_over_jags_and_the_same_seed_does_the_same():
+    assert _ended(1, 0.0) < 0.1 < 27.0
+    assert _ended(1, 0.02) < 3.0
+    assert _ended(3, 0.02) == _ended(3, 0.02) != _ended(4, 0.02)
+
+
+def test_the_strategy_passes_over_what_diverged():
+    strategy = Strategy(4, 1.0, 0)
+    points = strategy.ask()
+    strategy.tell(np.where(points[:, 0] > 0, np.inf, (points**2).sum(1)))
+    assert np.isfinite(strategy.ask()).all()
+
+
+def test_smooth_paths_are_not_jagged_and_jumps_are():
+    z = drawn(np.zeros(2), np.eye(2), 0)
+    assert len(z) == 2 * DRAWS + 1
+    assert np.allclose(z[:DRAWS], -z[DRAWS:-1])
+    frames = np.arange(8.0)[None, :, None, None]
+    line = z[:, 0, None, None, None] * frames
+    jump = np.where((z[:, 0, None, None, None] > 0.3) & (frames > 4), 6.0, 0.0)
+
+    def told(values):
+        flow = np.repeat(values[:, :-1, :, :, None], 2, -1)
+        return SimpleNamespace(
+            reach=values, flow=flow, moments=np.repeat(values, 3, -1), bad=np.zeros(len(z), bool), background=None
+        )
+
+    smooth, jagged = jaggedness(told(line)), jaggedness(told(line + jump))
+    assert np.allclose(smooth.reach, 0, atol=1e-9)
+    assert np.allclose(smooth.moments, 0, atol=1e-9)
+    assert np.allclose(jagged.reach[:5], 0, atol=1e-9)
+    assert (jagged.reach[5:] > 1).all()
+    assert jagged.flow.shape == (7, 1)
+    assert jagged.moments.shape == (8, 1, 3)
+
+
+def test_chaos_is_believed_as_far_as_the_fit_leaves_something():
+    jagged = Parts(np.full((9, 2), 5.0), np.full((8, 2), 5.0), np.full((9, 2, 3), 0.01), None)
+    left = Parts(np.full((9, 2, 6), 0.5), np.full((8, 2, 4, 2), 10.0), np.full((9, 2, 3), 0.5), None)
+    found = believed(jagged, left)
+    assert np.allclose(found.reach, EXCUSED * 0.5)
+    assert np.allclose(found.flow, 5.0)
+    assert np.allclose(found.moments, 0.01)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Bowl:
+    """Stands in for a hypothesis of a bowl around ``bottom``."""
+
+    bottom: tuple[float, ...]
+
+    @property
+    def dimension(self) -> int:
+        return len(self.bottom)
+
+
+class _Stuck:
+    """Least squares that stays where it begins."""
+
+    def residuals(self, hypothesis, points):
+        return None, ((points - np.array(hypothesis.bottom)) ** 2).sum(1) + 1.0
+
+    def fit(self, hypothesis, z, iterations):
+        cost = float(self.residuals(hypothesis, z[None])[1][0])
+        return Fit(hypothesis, z, cost, cost, np.eye(len(z)), z, -cost)
+
+
+def test_hypotheses_hand_each_other_base_parameters_and_none_gets_worse():
+    clip = _Stuck()
+    base = clip.fit(_Bowl((0.0, 0.0)), np.array([3.0, 3.0]), 0)
+    near = clip.fit(_Bowl((0.0, 0.0, 1.0)), np.array([0.1, 0.0, 1.0]), 0)
+    far = clip.fit(_Bowl((0.0, 0.0, 0.0)), np.array([2.0, 2.0, 0.0]), 0)
+    best = clip.fit(_Bowl((5.0, 5.0, 1.0)), np.array([5.0, 5.0, 1.0]), 0)
+    fitted = {("near", -1): (near, 1.0), ("far", -1): (far, 2.0), ("best", -1): (best, 3.0)}
+    again, shared = exchanged(clip, base, fitted)  # type: ignore[arg-type]
+    assert np.allclose(again.z, [0.1, 0.0])
+    assert np.allclose(shared[("far", -1)][0].z, [0.1, 0.0, 0.0])
+    assert shared[("best", -1)][0] is best
+    assert shared[("far", -1)][1] == 2.0
+    assert all(shared[key][0].cost <= fit.cost for key, (fit, _) in fitted.items())
