@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch, batch_from_scenes, scene_from_batch
 from mjx_refine.scene import Scene
-from mjx_refine.space.floor import levelled, with_effects
+from mjx_refine.space.effects import FIELD, effect_parameters, with_numbers
+from mjx_refine.space.floor import effects_of, levelled, with_effects
 from mjx_refine.space.layout import body_parameters, is_upright, lowest_extent, world_parameters
 from mjx_refine.space.parameter import Parameter
 
@@ -50,6 +51,8 @@ class Space:
             parameters += body_parameters(i, body, gap, lone=i == 0)
             fixed += _fixed_of_body(body.name, body.shape, i, len(scene.objects))
         parameters += world_parameters(scene)
+        acting, still = effect_parameters(scene)
+        parameters, fixed = parameters + acting, fixed + still
         return cls(scene, tuple(parameters), tuple(fixed))
 
     @property
@@ -94,7 +97,8 @@ class Space:
 
     def scene_at(self, u: Float[np.ndarray, "dimension"]) -> Scene:
         """The scene at one point of the unit box."""
-        return scene_from_batch(self.decode(np.asarray(u)[None]), 0, self.scene)
+        batch = self.decode(np.asarray(u)[None])
+        return with_numbers(scene_from_batch(batch, 0, self.scene), batch.effects)
 
     def _checked(self, u: np.ndarray) -> np.ndarray:
         if u.ndim != 2 or u.shape[1] != self.dimension:
@@ -112,13 +116,15 @@ class Space:
         u = self._checked(np.asarray(u, np.float64))
         count = len(u)
         base = batch_from_scenes([self.scene]).map(lambda a: np.repeat(a, count, 0))
-        raw = self._intermediate(base)
+        raw, effects = self._intermediate(base), effects_of(self.scene, count)
+        raw.update({f"{FIELD}{k}": e.values.copy() for k, e in enumerate(effects)})
         columns = zip(self.parameters, self._from_unit(u).T, strict=True)
         for parameter, value in (*self.held, *columns):
             i, k = parameter.index
             target = raw[parameter.field]
             target[(slice(None), k) if i < 0 else (slice(None), i, k)] = value
-        return with_effects(self._assemble(base, raw), self.scene)
+        numbers = tuple(dataclasses.replace(e, values=raw[f"{FIELD}{k}"]) for k, e in enumerate(effects))
+        return with_effects(self._assemble(base, raw), numbers)
 
     def _from_unit(self, u: Float[np.ndarray, "batch dimension"]) -> Float[np.ndarray, "batch dimension"]:
         """Every parameter's ``from_unit``, all at once."""

@@ -383,13 +383,20 @@ REFINED = [
 
 
 @pytest.mark.parametrize(("effects", "options"), REFINED)
-def test_effects_are_held_while_the_rest_is_refined(effects, options):
+def test_effects_are_refined_with_the_rest(effects, options):
     crate = dataclasses.replace(SCENE.objects[1], position=(0.7, 0.2, 0.35))
     truth = dataclasses.replace(SCENE, objects=(SCENE.objects[0], crate), effects=effects)
     clip = simulate(truth, (96, 64), 4, FPS)
     ball = dataclasses.replace(truth.objects[0], position=(-0.55, 0.3, 0.78), linear_velocity=(2.3, 0.1, 1.1))
     result = refine(dataclasses.replace(truth, objects=(ball, crate)), clip, options)
-    assert result.scene.effects == effects
+    for found, true in zip(result.scene.effects, effects, strict=True):
+        assert (found.effect, found.target, [k for k, _ in found.parameters]) == (
+            true.effect,
+            true.target,
+            [k for k, _ in true.parameters],
+        )
+        for (_, a), (_, b) in zip(found.parameters, true.parameters, strict=True):
+            assert a == pytest.approx(b, rel=0.35)
     assert result.refined.scores.fitness[0] > result.init.scores.fitness[0] + 0.01
     scored = evaluate_scene(result.scene, clip)
     assert scored["fitness"] == pytest.approx(float(result.refined.scores.fitness[0]), abs=1e-6)
