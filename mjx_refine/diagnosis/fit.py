@@ -326,8 +326,6 @@ class ClipFit:
                 jacobian, fresh, usual = self.jacobian(hypothesis, z, base, keep, scale, pace.size), True, 0.0
         if pace.size != STEPS[0] or not fresh:
             jacobian = self.jacobian(hypothesis, z, base, keep, scale)
-        if pace.size != STEPS[0]:
-            jacobian = self.jacobian(hypothesis, z, base, keep, scale)
         return self._finished(hypothesis, z, base, jacobian)
 
     def best_of(self, hypothesis: Hypothesis, points: Float[np.ndarray, "points dimension"], keep=None) -> np.ndarray:
@@ -360,14 +358,13 @@ class ClipFit:
         return fit
 
     @remembered
-    def roam(self, fit: Fit, seed: int, widths: tuple[float, ...] = ROAMED, keep=None) -> Fit:
+    def roam(self, fit: Fit, seed: int, widths: tuple[float, ...] = ROAMED) -> Fit:
         """Least squares again from where an evolution strategy ends that begins at a fit, in its posterior's coordinates.
 
         Args:
           fit: where to begin.
           seed: of the draws.
           widths: of the first generation in each round [posterior standard deviations].
-          keep: frames that count.
         """
         for width in widths:
             factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
@@ -376,12 +373,12 @@ class ClipFit:
             strategy = Strategy(len(fit.z), width, seed)
             for _ in range(GENERATIONS):
                 points = np.clip(fit.z + strategy.ask() @ factor, low, high)
-                costs = self.residuals(fit.hypothesis, points, keep)[1]
+                costs = self.residuals(fit.hypothesis, points)[1]
                 if np.min(costs) < best:
                     best, point = float(np.min(costs)), points[int(np.argmin(costs))]
                 strategy.tell(costs)
             if best < fit.cost:
-                trial = self.fit(fit.hypothesis, point, 8, keep)
+                trial = self.fit(fit.hypothesis, point, 8)
                 fit = trial if trial.cost < fit.cost else fit
         return fit
 
