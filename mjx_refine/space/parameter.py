@@ -16,7 +16,7 @@ class Parameter:
       name: ``box_0.friction.sliding``, ``camera.pitch``, ...
       unit: of its value.
       field: which intermediate array of the decoder it fills.
-      index: (object, component) in that array; object is -1 for camera and gravity.
+      index: (object, component) in that array; object is -1 for camera, gravity and effects.
       start: value in the starting scene.
       low: lower bound.
       high: upper bound.

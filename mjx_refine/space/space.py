@@ -117,14 +117,14 @@ class Space:
         count = len(u)
         base = batch_from_scenes([self.scene]).map(lambda a: np.repeat(a, count, 0))
         raw, effects = self._intermediate(base), effects_of(self.scene, count)
-        raw.update({f"{FIELD}{k}": e.values.copy() for k, e in enumerate(effects)})
+        # Filled in place, as all of raw is.
+        raw.update({f"{FIELD}{k}": e.values for k, e in enumerate(effects)})
         columns = zip(self.parameters, self._from_unit(u).T, strict=True)
         for parameter, value in (*self.held, *columns):
             i, k = parameter.index
             target = raw[parameter.field]
             target[(slice(None), k) if i < 0 else (slice(None), i, k)] = value
-        numbers = tuple(dataclasses.replace(e, values=raw[f"{FIELD}{k}"]) for k, e in enumerate(effects))
-        return with_effects(self._assemble(base, raw), numbers)
+        return with_effects(self._assemble(base, raw), effects)
 
     def _from_unit(self, u: Float[np.ndarray, "batch dimension"]) -> Float[np.ndarray, "batch dimension"]:
         """Every parameter's ``from_unit``, all at once."""
