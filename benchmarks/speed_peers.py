@@ -44,7 +44,7 @@ def warp_renderer(kind: str, population: int, count: int, size: tuple[int, int],
     began = time.perf_counter()
     batch, shapes = _batch(kind, population), KINDS[kind].shapes
     simulator = WarpSimulator(shapes, 30.0)
-    poses = jax.block_until_ready(simulator.launch(batch, frames))
+    poses = jax.block_until_ready(simulator.launch(batch, frames)())
     spec = build_spec(shapes, 30.0)
     half = batch.camera_pitch[0] / 2
     spec.worldbody.add_camera(
@@ -88,7 +88,7 @@ def warp_renderer(kind: str, population: int, count: int, size: tuple[int, int],
 
     best = generation()
     compiled = time.perf_counter() - began
-    physics = times(lambda: jax.block_until_ready(simulator.launch(batch, frames)), count)
+    physics = times(lambda: jax.block_until_ready(simulator.launch(batch, frames)()), count)
     return GpuPeer(physics, times(generation, count), compiled, f"best IoU {best:.3f}")
 
 
@@ -97,7 +97,7 @@ def plain_mjx(kind: str, population: int, count: int, size: tuple[int, int], fra
     began = time.perf_counter()
     batch, shapes = _batch(kind, population), KINDS[kind].shapes
     simulator = MjxSimulator(shapes, 30.0)
-    poses = jax.block_until_ready(simulator.launch(batch, frames))
+    poses = jax.block_until_ready(simulator.launch(batch, frames)())
     observation = simulate(KINDS[kind], size=size, frames=frames)
     focal = (size[1] / 2) / np.tan(batch.camera_fovy[0] / 2)
     x, y = np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5)
@@ -138,5 +138,5 @@ def plain_mjx(kind: str, population: int, count: int, size: tuple[int, int], fra
 
     best = generation()
     compiled = time.perf_counter() - began
-    physics = times(lambda: jax.block_until_ready(simulator.launch(batch, frames)), count)
+    physics = times(lambda: jax.block_until_ready(simulator.launch(batch, frames)()), count)
     return GpuPeer(physics, times(generation, count), compiled, f"best fitness {best:.3f}, one field of view for all")

@@ -77,7 +77,7 @@ def together(
         asked = [search.points() for search in searches]
         batch = concatenate([space.decode(points) for space, points in zip(spaces, asked, strict=True)])
         clock.append(time.perf_counter())
-        poses = launched(simulator, batch, frames)
+        poses = launched(simulator, batch, frames)()
         prices = np.split(price_of_overlap(reference, batch), clips)
         jax.block_until_ready(poses)
         clock.append(time.perf_counter())

@@ -13,6 +13,7 @@ from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
 from mjx_refine.generate.options import SIZE
 from mjx_refine.scene import Shape
+from mjx_refine.sim.model import half_extents
 
 HIGH, WIDE = 8, 16
 """Pixels of a tile. A line of one is 16 bytes of numbers and 32 of flow, which numpy moves as quickly as one value."""
@@ -76,7 +77,7 @@ def _bounds(shape: Shape, poses: Float[np.ndarray, "frames 7"], batch: SceneBatc
         low, high, top, bottom = _sphere_spans(centre, radius, focal)
     else:
         corners, edges = _corners(shape)
-        away = corners * _half_extents(batch, row)[number]
+        away = corners * half_extents(batch.shapes, batch.size[row])[number]
         turn = rotations.matrix(rotations.normalise(poses[:, 3:]))
         points = _in_camera(away @ turn.swapaxes(-1, -2) + poses[:, None, :3], batch, row)
         nearest_depth, farthest_depth = points[..., 2].min(-1), points[..., 2].max(-1)
@@ -171,15 +172,8 @@ def _corners(shape: Shape) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
 
 def nearest(qpos: Float[np.ndarray, "frames objects 7"], batch: SceneBatch, row: int) -> float:
     """The least distance from the camera to the sphere about an object's box [m]."""
-    radius = np.linalg.norm(_half_extents(batch, row), axis=-1)
+    radius = np.linalg.norm(half_extents(batch.shapes, batch.size[row]), axis=-1)
     return float((np.linalg.norm(qpos[..., :3] - batch.camera_position[row], axis=-1) - radius).min())
-
-
-def _half_extents(batch: SceneBatch, row: int) -> Float[np.ndarray, "objects 3"]:
-    """Of the box about each body, along its own axes [m]."""
-    size = batch.size[row]
-    columns = {"sphere": (0, 0, 0), "cylinder": (0, 0, 1), "box": (0, 1, 2)}
-    return np.stack([size[k, columns[shape]] for k, shape in enumerate(batch.shapes)])
 
 
 def ordered(place: Int[np.ndarray, "tiles"]) -> tuple[Int[np.ndarray, "lines"], Int[np.ndarray, "lines"]]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 
-import jax
-
 from mjx_refine.batch import batch_from_scenes
 from mjx_refine.many.jobs import Job
 from mjx_refine.observation import load_observation
@@ -40,7 +38,7 @@ def warm_up(job: Job, count: int, common: Options, simulator: Made) -> None:
         batch = batch_from_scenes([scene] * (count * population))
         with DEVICE:
             made = simulator(fastest(options.backend, len(batch)), scene.shapes, observation.fps)
-            poses = jax.block_until_ready(launched(made, batch, observation.length))
+            poses = launched(made, batch, observation.length)()
             GridScorer(scene.shapes, [clip] * count).compared(poses, batch, [population] * count)
     except Exception as error:
         log.info("%s: nothing compiled beforehand (%s)", job.name, error)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Array, Float
 from mjx_fitness import Scores
@@ -46,7 +48,7 @@ class Objective:
         if isinstance(self.scorer, GridScorer):
             poses = launched(self.simulator, batch, self.scorer.length)
             price = price_of_overlap(self.reference, batch)  # while the device computes
-            scores = self.scorer.score(poses, batch, [len(batch)])[0]
+            scores = self.scorer.score(poses(), batch, [len(batch)])[0]
             return price - scores.fitness, scores
         scores = self.scorer(self.simulator.rollout(batch, self.scorer.length), batch)
         return price_of_overlap(self.reference, batch) - scores.fitness, scores
@@ -54,10 +56,14 @@ class Objective:
 
 def launched(
     simulator: Simulator, batch: SceneBatch, frames: int
-) -> Float[Array | np.ndarray, "rows frames objects 7"]:
-    """Poses where ``GridScorer.score`` takes them: on the simulator's device, where it has one."""
+) -> Callable[[], Float[Array | np.ndarray, "rows frames objects 7"]]:
+    """Begins a rollout where the simulator can; what is returned waits for its poses, where ``GridScorer.score`` takes them: on
+    the simulator's device, where it has one."""
     launch = getattr(simulator, "launch", None)
-    return simulator.rollout(batch, frames) if launch is None or batch.effects else launch(batch, frames)
+    if launch is not None and not batch.effects:
+        return launch(batch, frames)
+    poses = simulator.rollout(batch, frames)
+    return lambda: poses
 
 
 def price_of_overlap(reference: MujocoSimulator, batch: SceneBatch) -> Float[np.ndarray, "batch"]:

@@ -33,7 +33,8 @@ LEAST = 64
 """A batch that does not fit in memory and is no larger than this fails."""
 
 DEVICE = threading.RLock()
-"""One thread at a time uses the device: Warp builds and records its kernels for all of a process."""
+"""One thread at a time gives the device something to do: Warp builds and records its kernels for all of a process. Threads wait
+for their rollouts without it."""
 
 CHECKPOINT_SECONDS = 10.0
 """Between two checkpoints of a clip; what is lost is computed again."""
@@ -203,8 +204,10 @@ class Together:
             counts[self.rows[id(member)]] = len(points)
         with DEVICE:
             poses = launched(self.simulator, batch, self.scorer.length)
-            prices = price_of_overlap(self.reference, batch)  # while the device computes
-            sums = self.scorer.compared(poses, batch, counts)
+        prices = price_of_overlap(self.reference, batch)  # while the device computes
+        shown = poses()
+        with DEVICE:
+            sums = self.scorer.compared(shown, batch, counts)
         scores = self.scorer.scored(sums, counts)
         own = np.split(prices, np.cumsum(counts)[:-1])
         rows = [self.rows[id(member)] for member, _, _ in part]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,9 @@ from mjx_refine.sim.model import SUBSTEPS, build_spec, initial_state
 
 BUCKETS = (1, 4, 16, 32, 64, 128, 256, 512, 1024, 1536, 2048, 3072, 4096, 6144, 8192)
 """Batch sizes that programs are compiled for; a batch is padded to the next."""
+
+Launched: TypeAlias = Callable[[], Float[Array, "rows frames objects 7"]]
+"""A rollout that a device computes: waits for it."""
 
 
 def bucket(count: int) -> int:
@@ -153,15 +157,16 @@ class MjxSimulator:
         simulator = self if acting.centre_of_mass(batch) is None else self._beside()
         return carried(batch, frames, lambda inside, needed, _: simulator._rollout(inside, needed))
 
-    def launch(self, batch: SceneBatch, frames: int) -> Float[Array, "rows frames objects 7"]:
-        """Poses on the device, which computes on when this returns; rows beyond the batch's repeat its last candidate.
+    def launch(self, batch: SceneBatch, frames: int) -> Launched:
+        """Begins a rollout; what is returned gives the poses on the device. Rows beyond the batch's repeat its last candidate.
 
         For scenes without effects. What has diverged is not marked.
         """
         full = padded(batch, len(self.devices), [size for size, length in self._programs if length == frames])
         qpos, qvel = initial_state(full)
         arguments = self.devices.dealt((leaves_of(full), jnp.asarray(qpos), jnp.asarray(qvel)))
-        return self._program(arguments, frames)(*arguments)
+        poses = self._program(arguments, frames)(*arguments)
+        return lambda: poses
 
     def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
-        return diverged_to_nan(np.asarray(self.launch(batch, frames), np.float64)[: len(batch)])
+        return diverged_to_nan(np.asarray(self.launch(batch, frames)(), np.float64)[: len(batch)])

@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import importlib.util
 import io
+from types import ModuleType
 
 if importlib.util.find_spec("warp") is not None:
     warp = importlib.import_module("warp")
@@ -14,4 +15,10 @@ if importlib.util.find_spec("warp") is not None:
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
-__all__ = ["mjx"]
+__all__ = ["mjx", "warp_engine"]
+
+
+def warp_engine() -> ModuleType:
+    """The engine that MJX drives through Warp, itself; it cannot be imported where Warp is not installed."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        return importlib.import_module("mujoco.mjx.third_party.mujoco_warp")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -20,11 +21,17 @@ FRICTION_DAMPING = -30.0
 TORSION = 0.005
 """Torsional friction of every contact [m]."""
 
-_GEOM = {
+_GEOM: dict[Shape, mujoco.mjtGeom] = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "box": mujoco.mjtGeom.mjGEOM_BOX,
     "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
 }
+
+
+_SHAPE: dict[int, Shape] = {int(kind): shape for shape, kind in _GEOM.items()}
+
+_HALF = {"sphere": [0, 0, 0], "cylinder": [0, 0, 1], "box": [0, 1, 2]}
+"""Which of a geom's sizes are its half extents."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,7 +149,7 @@ def apply_fields(
         model.body_ipos[1:] = centre_of_mass
     model.geom_size[1:] = fields.geom_size[row]
     model.geom_rbound[1:] = fields.geom_rbound[row]
-    model.geom_aabb[1:, 3:] = _half_extents(model, fields.geom_size[row])
+    model.geom_aabb[1:, 3:] = half_extents([_SHAPE[kind] for kind in model.geom_type[1:]], fields.geom_size[row])
     model.body_mass[1:] = fields.body_mass[row]
     model.body_subtreemass[1:] = fields.body_mass[row]
     model.body_subtreemass[0] = fields.body_mass[row].sum()
@@ -159,14 +166,11 @@ def apply_fields(
     model.opt.gravity[:] = fields.gravity[row]
 
 
-def _half_extents(model: mujoco.MjModel, size: np.ndarray) -> np.ndarray:
-    half = size.copy()
-    for i, kind in enumerate(model.geom_type[1:]):
-        if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-            half[i] = size[i, 0]
-        elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-            half[i] = size[i, 0], size[i, 0], size[i, 1]
-    return half
+def half_extents(
+    shapes: Sequence[Shape], size: Float[np.ndarray, "*batch objects 3"]
+) -> Float[np.ndarray, "*batch objects 3"]:
+    """Of the box about each body, along its own axes [m]."""
+    return np.stack([size[..., i, _HALF[shape]] for i, shape in enumerate(shapes)], -2)
 
 
 def initial_state(batch: SceneBatch) -> tuple[np.ndarray, np.ndarray]:

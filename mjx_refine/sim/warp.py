@@ -1,15 +1,15 @@
-"""MJX-Warp: MuJoCo's own algorithms as CUDA kernels, called from JAX; for NVIDIA GPUs."""
+"""MJX-Warp: MuJoCo's own algorithms as CUDA kernels, for NVIDIA GPUs."""
 
 from __future__ import annotations
 
 import functools
 import importlib.util
-from typing import cast
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.compile_cache import compiling
@@ -17,10 +17,11 @@ from mjx_refine.effects import acting
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Shape
 from mjx_refine.sim.carried import carried, refuse_loads
-from mjx_refine.sim.leaves import Leaves, candidate_model, leaves_of
-from mjx_refine.sim.mjx import diverged_to_nan, padded
-from mjx_refine.sim.mjx_import import mjx
-from mjx_refine.sim.model import SUBSTEPS, build_spec, contact_pairs, initial_state
+from mjx_refine.sim.mjx import Launched, diverged_to_nan, padded
+from mjx_refine.sim.model import build_spec, contact_pairs, initial_state, model_fields
+
+if TYPE_CHECKING:
+    from mjx_refine.sim.worlds import Worlds
 
 REMEDY = "pip install 'mjx-refine[warp]' on a machine with an NVIDIA GPU, or choose --backend mujoco"
 
@@ -86,42 +87,21 @@ class WarpSimulator:
         self._mujoco = build_spec(shapes, fps, off_centre=off_centre).compile()
         self._mujoco.opt.iterations = iterations
         self._mujoco.opt.ls_iterations = ls_iterations
-        model = mjx.put_model(self._mujoco, impl="warp")
-        # Too few iterations in some step are no news (the solver went as far as it may); too few contacts would be.
-        silent = model.opt._impl.warn_overflow & ~_ITERATION_WARNINGS
-        self._model = cast(mjx.Model, model.tree_replace({"opt._impl.warn_overflow": silent}))
-        self._programs: dict[tuple[int, int], jax.stages.Compiled] = {}
+        self._off_centre = off_centre
+        self._worlds: dict[tuple[int, int], Worlds] = {}
 
-    def _data(self, size: int) -> mjx.Data:
-        """Empty data with room for the contacts of ``size`` candidates."""
-        points = contact_points(self.shapes)
-        # Warp keeps one list of contacts for all candidates, and constraint rows for each: six a contact.
-        return mjx.make_data(self._mujoco, impl="warp", naconmax=size * points, njmax=6 * points)
+    def _made(self, size: int, frames: int) -> Worlds:
+        if (size, frames) not in self._worlds:
+            # Imported here, because it needs Warp.
+            from mjx_refine.sim.worlds import Worlds
 
-    def _trajectory(
-        self, data: mjx.Data, leaves: Leaves, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], frames: int
-    ) -> Float[Array, "frames objects 7"]:
-        model = candidate_model(self._model, leaves, self.shapes)
-
-        def substep(data, _):
-            return mjx.step(model, data), None
-
-        def frame(data, _):
-            data, _ = jax.lax.scan(substep, data, None, length=SUBSTEPS)
-            return data, data.qpos
-
-        start = data.replace(qpos=qpos, qvel=qvel)
-        _, later = jax.lax.scan(frame, start, None, length=frames - 1)
-        return jnp.concatenate([qpos[None], later]).reshape(frames, len(self.shapes), 7)
-
-    def _program(self, arguments: tuple[Leaves, jax.Array, jax.Array], frames: int) -> jax.stages.Compiled:
-        size = len(arguments[1])
-        if (size, frames) not in self._programs:
             with compiling(f"MJX-Warp physics of {'+'.join(self.shapes)}, {size} candidates, {frames} frames"):
-                data = self._data(size)
-                program = jax.jit(jax.vmap(functools.partial(self._trajectory, data, frames=frames)))
-                self._programs[size, frames] = program.lower(*arguments).compile()
-        return self._programs[size, frames]
+                points = contact_points(self.shapes)
+                # Too few iterations in some step are no news (the solver went as far as it may); too few contacts would be.
+                self._worlds[size, frames] = Worlds(
+                    self._mujoco, size, frames, points, self._off_centre, silent=_ITERATION_WARNINGS
+                )
+        return self._worlds[size, frames]
 
     def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
         """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged.
@@ -140,15 +120,23 @@ class WarpSimulator:
         simulator = self if acting.centre_of_mass(batch) is None else self._beside()
         return carried(batch, frames, lambda inside, needed, _: simulator._rollout(inside, needed))
 
-    def launch(self, batch: SceneBatch, frames: int) -> Float[Array, "rows frames objects 7"]:
-        """Poses on the device, which computes on when this returns; rows beyond the batch's repeat its last candidate.
+    def launch(self, batch: SceneBatch, frames: int) -> Launched:
+        """Begins a rollout; what is returned waits for it and gives the poses on the device, and must be called before the
+        next one of as many candidates begins. Rows beyond the batch's repeat its last candidate.
 
-        For scenes without effects. What has diverged is not marked.
+        For scenes without effects that act on motion. What has diverged is not marked.
         """
-        full = padded(batch, compiled=[size for size, length in self._programs if length == frames])
-        qpos, qvel = initial_state(full)
-        arguments = (leaves_of(full), jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
-        return self._program(arguments, frames)(*arguments)
+        from mjx_refine.sim.worlds import changed_fields
+
+        full = padded(batch, compiled=[size for size, length in self._worlds if length == frames])
+        worlds = self._made(len(full), frames)
+        centre = acting.centre_of_mass(full) if full.effects else None
+        fields = model_fields(full)
+        worlds.start(changed_fields(self._mujoco, self.shapes, fields, centre), fields.gravity, *initial_state(full))
+        shape = (len(full), frames, len(self.shapes), 7)
+        return lambda: jax.block_until_ready(jnp.array(jax.dlpack.from_dlpack(worlds.finished()), copy=True)).reshape(
+            shape
+        )
 
     def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
-        return diverged_to_nan(np.asarray(self.launch(batch, frames), np.float64)[: len(batch)])
+        return diverged_to_nan(np.asarray(self.launch(batch, frames)(), np.float64)[: len(batch)])

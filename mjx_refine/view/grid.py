@@ -162,8 +162,8 @@ class GridScorer:
 
     def compared(
         self, poses: Float[Array | np.ndarray, "rows frames objects 7"], batch: SceneBatch, counts: Sequence[int]
-    ) -> Float[np.ndarray, "sums places frames"]:
-        """The device's part: sums over samples, for ``scored``.
+    ) -> Float[Array, "sums places frames"]:
+        """The device's part, which goes on when this returns: sums over samples, for ``scored``.
 
         Args:
           poses: of the candidates of all clips, one clip after the other; there may be further rows.
@@ -179,17 +179,17 @@ class GridScorer:
             poses = np.concatenate([poses, np.zeros((room - len(poses), *poses.shape[1:]), np.float32)])
         shown = jnp.asarray(poses, jnp.float32), jnp.asarray(seen_from)
         static = (self.shapes, self.image, self.moving_only, layout.chunk)
-        return np.asarray(_compared(*static, *shown, layout.row, layout.clip, self._clips))
+        return _compared(*static, *shown, layout.row, layout.clip, self._clips)
 
-    def scored(self, totals: Float[np.ndarray, "sums places frames"], counts: Sequence[int]) -> list[Scores]:
+    def scored(self, sums: Float[Array | np.ndarray, "sums places frames"], counts: Sequence[int]) -> list[Scores]:
         """Each clip's scores from what ``compared`` returned for these ``counts``."""
         layout = self._layout(tuple(counts), sum(counts))
-        totals = totals[:, layout.place].astype(np.float64)
+        totals = np.asarray(sums)[:, layout.place].astype(np.float64)
         lost = totals[0, :, 0] < 0
         totals = np.where(lost[:, None], -1.0 - totals, totals)
         seen = {name: values[layout.owner] for name, values in self._observed.items()}
-        sums = _sums(totals, seen, len(self.shapes))
-        return [_marked(one, gone) for one, gone in zip(self._scores(sums, counts), _split(lost, counts), strict=True)]
+        scores = self._scores(_sums(totals, seen, len(self.shapes)), counts)
+        return [_marked(one, gone) for one, gone in zip(scores, _split(lost, counts), strict=True)]
 
     def _scores(self, sums: Sums, counts: Sequence[int]) -> list[Scores]:
         """Scores by clip; at one go where all have the same weights."""
