@@ -16,6 +16,7 @@ import warp as wp
 from jaxtyping import Float
 
 from mjx_refine.scene import Shape
+from mjx_refine.sim.cones import fast_cones
 from mjx_refine.sim.mjx_import import warp_engine
 from mjx_refine.sim.model import SUBSTEPS, ModelFields, half_extents
 
@@ -111,8 +112,9 @@ class Worlds:
         self._frame.zero_()
 
     def _advance(self) -> None:
-        for _ in range(SUBSTEPS):
-            engine.step(self._model, self._data)
+        with fast_cones():
+            for _ in range(SUBSTEPS):
+                engine.step(self._model, self._data)
         wp.launch(_next, 1, inputs=[self._frame])
         wp.launch(_keep, self._data.qpos.shape, inputs=[self._frame, self._data.qpos, self._poses])
 

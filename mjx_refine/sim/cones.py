@@ -1,0 +1,138 @@
+"""The kernel that adds the curvature of friction cones to the solver's Hessian, for free bodies only.
+
+MJX-Warp's own looks at every pair of degrees of freedom of the scene for every contact. A contact touches two bodies, which
+have twelve: of four objects that is 78 pairs instead of 300, and the kernel took a quarter of a step.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections.abc import Iterator
+
+import warp as wp
+
+from mjx_refine.sim.mjx_import import warp_engine
+
+_solver = importlib.import_module(f"{warp_engine().__name__}._src.solver")
+_types = importlib.import_module(f"{warp_engine().__name__}._src.types")
+
+_CONE = wp.constant(int(_types.ConstraintState.CONE))
+_PAIRS = wp.constant(78)
+"""Entries of the upper triangle of twelve degrees of freedom."""
+
+
+@wp.func
+def _involved(jacobian: wp.array3d(dtype=float), world: int, row: int, body: int) -> bool:
+    """Whether a contact's normal moves the body: a unit vector has some component."""
+    first = 6 * body
+    return (
+        jacobian[world, row, first] != 0.0
+        or jacobian[world, row, first + 1] != 0.0
+        or jacobian[world, row, first + 2] != 0.0
+    )
+
+
+@wp.kernel
+def cone_curvature(
+    impratio_invsqrt: wp.array(dtype=float),
+    tri_row: wp.array(dtype=int),
+    tri_col: wp.array(dtype=int),
+    distance: wp.array(dtype=float),
+    margin: wp.array(dtype=float),
+    friction: wp.array(dtype=_types.vec5),
+    dimension: wp.array(dtype=int),
+    address: wp.array2d(dtype=int),
+    world_of: wp.array(dtype=int),
+    jacobian: wp.array3d(dtype=float),
+    weight: wp.array2d(dtype=float),
+    state: wp.array2d(dtype=int),
+    most: int,
+    count: wp.array(dtype=int),
+    residual: wp.array2d(dtype=float),
+    done: wp.array(dtype=bool),
+    repeats: int,
+    blocks: int,
+    hessian: wp.array3d(dtype=float),
+):
+    """Arguments as of ``solver._update_gradient_JTCJ_dense``; threads take contacts' pairs in turns."""
+    block, element = wp.tid()
+    width = tri_row.shape[0]
+    bodies = (tri_row[width - 1] + 1) // 6
+    for item in range(block * width + element, wp.min(count[0], most) * _PAIRS, blocks * width):
+        contact = item // _PAIRS
+        pair = item - contact * _PAIRS
+        world = world_of[contact]
+        if done[world] or dimension[contact] == 1 or distance[contact] - margin[contact] >= 0.0:
+            continue
+        row = address[contact, 0]
+        if row < 0:
+            continue
+        if state[world, row] != _CONE:
+            continue
+        # The pair (i, j), i <= j < 12, number j (j + 1) / 2 + i.
+        j = int((wp.sqrt(8.0 * float(pair) + 1.0) - 1.0) * 0.5)
+        if (j + 1) * (j + 2) // 2 <= pair:
+            j += 1
+        if j * (j + 1) // 2 > pair:
+            j -= 1
+        i = pair - j * (j + 1) // 2
+        first = int(-1)
+        second = int(-1)
+        for body in range(bodies):
+            if _involved(jacobian, world, row, body):
+                if first < 0:
+                    first = body
+                else:
+                    second = body
+        if first < 0 or (j >= 6 and second < 0):
+            continue
+        column = 6 * first + j
+        if j >= 6:
+            column = 6 * second + j - 6
+        line = 6 * first + i
+        if i >= 6:
+            line = 6 * second + i - 6
+
+        scale = friction[contact]
+        mu = scale[0] * impratio_invsqrt[world % impratio_invsqrt.shape[0]]
+        squared = mu * mu
+        stiffness = weight[world, row] / wp.max(squared * (1.0 + squared), 1.0e-15)
+        if stiffness == 0.0:
+            continue
+        a0 = mu * jacobian[world, row, line]
+        b0 = mu * jacobian[world, row, column]
+        slip = float(0.0)
+        along_a = float(0.0)
+        along_b = float(0.0)
+        across = float(0.0)
+        for k in range(1, dimension[contact]):
+            at = address[contact, k]
+            if at >= 0:
+                u = residual[world, at] * scale[k - 1]
+                a = scale[k - 1] * jacobian[world, at, line]
+                b = scale[k - 1] * jacobian[world, at, column]
+                slip += u * u
+                along_a += u * a
+                along_b += u * b
+                across += a * b
+        length = wp.max(wp.sqrt(slip), 1.0e-15)
+        along_a /= length
+        along_b /= length
+        pull = mu * residual[world, row] * mu / length
+        entry = a0 * b0 - mu * (a0 * along_b + b0 * along_a) + pull * along_a * along_b + (squared - pull) * across
+        wp.atomic_add(hessian, world, line, column, stiffness * entry)
+
+
+@contextlib.contextmanager
+def fast_cones() -> Iterator[None]:
+    """While it lasts, steps are made with ``cone_curvature`` where the solver has the kernel that it stands for."""
+    own = getattr(_solver, "_update_gradient_JTCJ_dense", None)
+    if own is None or len(own.adj.args) != len(cone_curvature.adj.args):
+        yield
+        return
+    _solver._update_gradient_JTCJ_dense = cone_curvature
+    try:
+        yield
+    finally:
+        _solver._update_gradient_JTCJ_dense = own
