@@ -115,7 +115,7 @@ class DoubleMjx(MjxSimulator):
 def reference(shapes) -> MujocoSimulator:
     """C MuJoCo whose solver goes on to the last digit."""
     made = MujocoSimulator(shapes, FPS, threads=1)
-    made._models[0].opt.tolerance = 1e-14
+    made.model.opt.tolerance = 1e-14
     return made
 
 

@@ -14,7 +14,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting
 from mjx_refine.scene import Shape
 from mjx_refine.sim.carried import carried
-from mjx_refine.sim.model import SUBSTEPS, apply_fields, build_spec, initial_state, model_fields
+from mjx_refine.sim.model import IDLE, SUBSTEPS, Edited, build_spec, field_arrays, initial_state, model_fields
 from mjx_refine.sim.stepped import stepped_rollout
 
 # MuJoCo's default handler appends to MUJOCO_LOG.TXT in the working directory. A candidate that diverges is no news.
@@ -37,15 +37,22 @@ class MujocoSimulator:
         self.shapes = shapes
         self.fps = fps
         self.threads = threads or os.cpu_count() or 1
-        self._models = [self._compiled(False)]
-        self._data = [mujoco.MjData(self._models[0]) for _ in range(self.threads)]
-        self._off_centre: tuple[list[mujoco.MjModel], list[mujoco.MjData]] | None = None
-        self._pool: rollout.Rollout | None = None
+        self.model = self._compiled(False)
+        """Of which every candidate has an edited copy."""
+        self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
+        self._edited: list[Edited] = []
+        self._off_centre: tuple[mujoco.MjModel, list[mujoco.MjData], list[Edited]] | None = None
+        self._threads: rollout.Rollout | None = None
+
+    def _pool(self) -> rollout.Rollout:
+        if self._threads is None:
+            self._threads = rollout.Rollout(nthread=self.threads if self.threads > 1 else 0)
+        return self._threads
 
     def _compiled(self, off_centre: bool) -> mujoco.MjModel:
         model = build_spec(self.shapes, self.fps, off_centre=off_centre).compile()
         # A diverged candidate must stay diverged: a silent reset would score its first frame again.
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        model.opt.disableflags |= IDLE | mujoco.mjtDisableBit.mjDSBL_AUTORESET
         return model
 
     def _prepare(self, batch: SceneBatch) -> list[mujoco.MjModel]:
@@ -56,18 +63,20 @@ class MujocoSimulator:
         if batch.shapes != self.shapes:
             raise ValueError(f"scene kind {batch.shapes}; this simulator was made for {self.shapes}")
         centre = acting.centre_of_mass(batch) if batch.effects else None
-        models, data = self._models, self._data
+        model, data, edited = self.model, self._data, self._edited
         if centre is not None:
             if self._off_centre is None:
                 model = self._compiled(True)
-                self._off_centre = [model], [mujoco.MjData(model) for _ in range(self.threads)]
-            models, data = self._off_centre
-        while len(models) < len(batch):
-            models.append(copy.copy(models[0]))
+                self._off_centre = model, [mujoco.MjData(model) for _ in range(self.threads)], []
+            model, data, edited = self._off_centre
         fields = model_fields(batch)
-        for row in range(len(batch)):
-            apply_fields(models[row], fields, row, None if centre is None else centre[row])
-        return models[: len(batch)], data
+        arrays = field_arrays(self.shapes, fields, centre)
+        while len(edited) < len(batch):
+            edited.append(Edited(copy.copy(model), arrays))
+        inertia = arrays["dof_M0"].mean(1)
+        for row, one in enumerate(edited[: len(batch)]):
+            one.write([array[row] for array in arrays.values()], inertia[row], fields.gravity[row])
+        return [one.model for one in edited[: len(batch)]], data
 
     def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
         """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged.
@@ -89,11 +98,9 @@ class MujocoSimulator:
         state = np.zeros((len(batch), size))
         state[:, 1 : 1 + qpos.shape[1] + qvel.shape[1]] = np.concatenate([qpos, qvel], 1)
         if batch.effects and acting.has_loads(batch):
-            if self._pool is None:
-                self._pool = rollout.Rollout(nthread=self.threads if self.threads > 1 else 0)
-            later = stepped_rollout(self._pool, models, data, state, batch, frames, world)
+            later = stepped_rollout(self._pool(), models, data, state, batch, frames, world)
         else:
-            states, _ = rollout.rollout(models, data, state, nstep=(frames - 1) * SUBSTEPS)
+            states, _ = self._pool().rollout(models, data, state, nstep=(frames - 1) * SUBSTEPS)
             later = np.asarray(states)[:, SUBSTEPS - 1 :: SUBSTEPS, 1 : 1 + qpos.shape[1]]
         return np.concatenate([first, later], 1)
 

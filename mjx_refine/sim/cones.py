@@ -4,6 +4,8 @@ MJX-Warp's own looks at every pair of degrees of freedom of the scene for every 
 have twelve: of four objects that is 78 pairs instead of 300, and the kernel took a quarter of a step.
 """
 
+# pyright: reportInvalidTypeForm=false
+
 from __future__ import annotations
 
 import contextlib

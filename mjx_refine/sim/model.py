@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import mujoco
 import numpy as np
@@ -20,6 +20,10 @@ FRICTION_DAMPING = -30.0
 
 TORSION = 0.005
 """Torsional friction of every contact [m]."""
+
+_IDLE = ("EQUALITY", "FRICTIONLOSS", "LIMIT", "SPRING", "DAMPER", "ACTUATION", "CLAMPCTRL", "SENSOR", "EULERDAMP")
+IDLE = sum(int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in _IDLE)
+"""Parts of the engine that find nothing to do in free bodies on a floor: turned off, a step is the same and cheaper."""
 
 _GEOM: dict[Shape, mujoco.mjtGeom] = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -137,33 +141,68 @@ def uniform_inertia(batch: SceneBatch) -> Float[np.ndarray, "batch objects 3"]:
     return np.stack(columns, 1)
 
 
-def apply_fields(
-    model: mujoco.MjModel, fields: ModelFields, row: int, centre_of_mass: Float[np.ndarray, "objects 3"] | None = None
-) -> None:
-    """Writes candidate ``row`` into ``model`` in place, as the compiler would have.
+ABOVE_FLOOR = ("geom_size", "geom_rbound", "geom_aabb", "body_mass", "body_inertia", "body_invweight0", "body_ipos")
+"""Names of ``field_arrays`` whose rows are the objects' alone: row 0 of the model's, the floor's or world's, stays."""
+
+
+def field_arrays(
+    shapes: Sequence[Shape],
+    fields: ModelFields,
+    centre_of_mass: Float[np.ndarray, "batch objects 3"] | None = None,
+) -> dict[str, np.ndarray]:
+    """What candidates write into the model's arrays, by the arrays' names, with a leading batch axis.
 
     ``centre_of_mass`` is in the bodies' frames [m]; the moments of inertia about it stay those of the uniform body.
     """
-    if centre_of_mass is not None:
-        # Of a model that ``build_spec`` made off centre.
-        model.body_ipos[1:] = centre_of_mass
-    model.geom_size[1:] = fields.geom_size[row]
-    model.geom_rbound[1:] = fields.geom_rbound[row]
-    model.geom_aabb[1:, 3:] = half_extents([_SHAPE[kind] for kind in model.geom_type[1:]], fields.geom_size[row])
-    model.body_mass[1:] = fields.body_mass[row]
-    model.body_subtreemass[1:] = fields.body_mass[row]
-    model.body_subtreemass[0] = fields.body_mass[row].sum()
-    model.body_inertia[1:] = fields.body_inertia[row]
-    model.body_invweight0[1:] = fields.body_invweight0[row]
-    dof = np.repeat(fields.body_invweight0[row], 3, axis=-1)
-    model.dof_invweight0[:] = dof.reshape(-1)
-    mass_matrix = np.concatenate([np.repeat(fields.body_mass[row][:, None], 3, 1), fields.body_inertia[row]], -1)
-    model.dof_M0[:] = mass_matrix.reshape(-1)
-    model.stat.meaninertia = mass_matrix.mean()
-    model.pair_friction[:] = fields.pair_friction[row]
-    model.pair_solref[:] = fields.pair_solref[row]
-    model.pair_solreffriction[:] = fields.pair_solreffriction[row]
-    model.opt.gravity[:] = fields.gravity[row]
+    mass, weight = fields.body_mass, fields.body_invweight0
+    half = half_extents(shapes, fields.geom_size)
+    arrays = {
+        "geom_size": fields.geom_size,
+        "geom_rbound": fields.geom_rbound,
+        "geom_aabb": np.concatenate([np.zeros_like(half), half], -1),
+        "body_mass": mass,
+        "body_subtreemass": np.concatenate([mass.sum(1, keepdims=True), mass], 1),
+        "body_inertia": fields.body_inertia,
+        "body_invweight0": weight,
+        "dof_invweight0": np.repeat(weight, 3, axis=-1).reshape(len(weight), -1),
+        "dof_M0": np.concatenate([np.repeat(mass[..., None], 3, -1), fields.body_inertia], -1).reshape(len(mass), -1),
+        "pair_friction": fields.pair_friction,
+        "pair_solref": fields.pair_solref,
+        "pair_solreffriction": fields.pair_solreffriction,
+    }
+    # Of a model that ``build_spec`` made off centre.
+    return arrays if centre_of_mass is None else arrays | {"body_ipos": centre_of_mass}
+
+
+class Edited:
+    """A model that is edited in place, candidate by candidate, as the compiler would have made it.
+
+    Args:
+      model: of the scene kind.
+      names: of the arrays to be edited.
+    """
+
+    def __init__(self, model: mujoco.MjModel, names: Iterable[str]):
+        self.model = model
+        self._views = [getattr(model, name)[1:] if name in ABOVE_FLOOR else getattr(model, name) for name in names]
+
+    def write(self, arrays: Iterable[np.ndarray], mean_inertia: float, gravity: Float[np.ndarray, "3"]) -> None:
+        """Writes one candidate's ``arrays``, in the order of the names."""
+        for view, values in zip(self._views, arrays, strict=True):
+            view[...] = values
+        self.model.stat.meaninertia = mean_inertia
+        self.model.opt.gravity[:] = gravity
+
+
+def apply_fields(
+    model: mujoco.MjModel, fields: ModelFields, row: int, centre_of_mass: Float[np.ndarray, "objects 3"] | None = None
+) -> None:
+    """Writes candidate ``row`` into ``model`` in place; ``centre_of_mass`` as in ``field_arrays``."""
+    one = ModelFields(**{f.name: getattr(fields, f.name)[row : row + 1] for f in dataclasses.fields(fields)})
+    centre = None if centre_of_mass is None else centre_of_mass[None]
+    arrays = field_arrays([_SHAPE[int(kind)] for kind in model.geom_type[1:]], one, centre)
+    only = [array[0] for array in arrays.values()]
+    Edited(model, arrays).write(only, float(arrays["dof_M0"].mean()), fields.gravity[row])
 
 
 def half_extents(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.compile_cache import compiling
@@ -17,8 +17,8 @@ from mjx_refine.effects import acting
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Shape
 from mjx_refine.sim.carried import carried, refuse_loads
-from mjx_refine.sim.mjx import Launched, diverged_to_nan, padded
-from mjx_refine.sim.model import build_spec, contact_pairs, initial_state, model_fields
+from mjx_refine.sim.mjx import Launched, bucket, diverged_to_nan
+from mjx_refine.sim.model import IDLE, build_spec, contact_pairs, field_arrays, initial_state, model_fields
 
 if TYPE_CHECKING:
     from mjx_refine.sim.worlds import Worlds
@@ -27,6 +27,16 @@ REMEDY = "pip install 'mjx-refine[warp]' on a machine with an NVIDIA GPU, or cho
 
 _ITERATION_WARNINGS = (1 << 9) | (1 << 10)
 """Warp's ``OverflowType.ITERATIONS`` and ``LS_ITERATIONS``."""
+
+FINE = 128
+"""Worlds for at least as many candidates are made in multiples of it: thousands fill a GPU, and a size is recorded in a third
+of a second."""
+
+SPARE = 1.25
+"""Worlds with up to this many times the room serve fewer candidates."""
+
+KEPT = 4
+"""Worlds of a scene kind that are kept."""
 
 _POINTS = {("floor", "sphere"): 1, ("floor", "box"): 8, ("floor", "cylinder"): 4}
 
@@ -85,23 +95,32 @@ class WarpSimulator:
         self._beside = functools.cache(lambda: WarpSimulator(shapes, fps, iterations, ls_iterations, any_device, True))
         self.device = jax.devices()[0].device_kind
         self._mujoco = build_spec(shapes, fps, off_centre=off_centre).compile()
+        self._mujoco.opt.disableflags |= IDLE
         self._mujoco.opt.iterations = iterations
         self._mujoco.opt.ls_iterations = ls_iterations
-        self._off_centre = off_centre
-        self._worlds: dict[tuple[int, int], Worlds] = {}
+        self._worlds: list[Worlds] = []
 
-    def _made(self, size: int, frames: int) -> Worlds:
-        if (size, frames) not in self._worlds:
-            # Imported here, because it needs Warp.
-            from mjx_refine.sim.worlds import Worlds
+    def _room(self, count: int, frames: int) -> int:
+        """Candidates to make worlds for: as some have that are there, if hardly more, else a few more than ``count``."""
+        there = [w.size for w in self._worlds if w.frames == frames and count <= w.size <= SPARE * count]
+        return min(there, default=bucket(count) if count < FINE else -(-count // FINE) * FINE)
 
+    def _idle(self, size: int, frames: int, changed: dict[str, np.ndarray]) -> Worlds:
+        """Worlds that no rollout is going on in."""
+        # Imported here, because it needs Warp.
+        from mjx_refine.sim.worlds import Worlds
+
+        found = next((w for w in self._worlds if (w.size, w.frames, w.busy) == (size, frames, False)), None)
+        if found is None:
             with compiling(f"MJX-Warp physics of {'+'.join(self.shapes)}, {size} candidates, {frames} frames"):
                 points = contact_points(self.shapes)
                 # Too few iterations in some step are no news (the solver went as far as it may); too few contacts would be.
-                self._worlds[size, frames] = Worlds(
-                    self._mujoco, size, frames, points, self._off_centre, silent=_ITERATION_WARNINGS
-                )
-        return self._worlds[size, frames]
+                found = Worlds(self._mujoco, changed, size, frames, points, silent=_ITERATION_WARNINGS)
+            idle = [w for w in self._worlds if not w.busy]
+            for old in idle[: max(0, len(self._worlds) + 1 - KEPT)]:
+                self._worlds.remove(old)
+            self._worlds.append(found)
+        return found
 
     def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
         """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged.
@@ -121,22 +140,27 @@ class WarpSimulator:
         return carried(batch, frames, lambda inside, needed, _: simulator._rollout(inside, needed))
 
     def launch(self, batch: SceneBatch, frames: int) -> Launched:
-        """Begins a rollout; what is returned waits for it and gives the poses on the device, and must be called before the
-        next one of as many candidates begins. Rows beyond the batch's repeat its last candidate.
+        """Begins a rollout; what is returned waits for it and gives the poses on the device. Rows beyond the batch's repeat its
+        last candidate.
 
         For scenes without effects that act on motion. What has diverged is not marked.
         """
         from mjx_refine.sim.worlds import changed_fields
 
-        full = padded(batch, compiled=[size for size, length in self._worlds if length == frames])
-        worlds = self._made(len(full), frames)
+        room = self._room(len(batch), frames)
+        full = batch[np.minimum(np.arange(room), len(batch) - 1)]
         centre = acting.centre_of_mass(full) if full.effects else None
         fields = model_fields(full)
-        worlds.start(changed_fields(self._mujoco, self.shapes, fields, centre), fields.gravity, *initial_state(full))
-        shape = (len(full), frames, len(self.shapes), 7)
-        return lambda: jax.block_until_ready(jnp.array(jax.dlpack.from_dlpack(worlds.finished()), copy=True)).reshape(
-            shape
-        )
+        changed = changed_fields(self._mujoco, field_arrays(self.shapes, fields, centre))
+        worlds = self._idle(room, frames, changed)
+        worlds.start(changed, fields.gravity, *initial_state(full))
+
+        def poses() -> Float[Array, "rows frames objects 7"]:
+            kept = jax.block_until_ready(jnp.array(jax.dlpack.from_dlpack(worlds.finished()), copy=True))
+            worlds.busy = False
+            return kept.reshape(room, frames, len(self.shapes), 7)
+
+        return poses
 
     def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
         return diverged_to_nan(np.asarray(self.launch(batch, frames)(), np.float64)[: len(batch)])

@@ -4,69 +4,40 @@ MJX calls Warp once a step and waits in JAX's only stream. Here a frame is one g
 batches of different scene kinds share a GPU, which neither of them fills, and Python does nothing while they run.
 """
 
+# pyright: reportInvalidTypeForm=false
+
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import mujoco
 import numpy as np
 import warp as wp
-from jaxtyping import Float
 
-from mjx_refine.scene import Shape
 from mjx_refine.sim.cones import fast_cones
 from mjx_refine.sim.mjx_import import warp_engine
-from mjx_refine.sim.model import SUBSTEPS, ModelFields, half_extents
+from mjx_refine.sim.model import ABOVE_FLOOR, SUBSTEPS
 
 engine = warp_engine()
 
-BATCHED = (
-    "geom_size",
-    "geom_rbound",
-    "geom_aabb",
-    "body_mass",
-    "body_subtreemass",
-    "body_inertia",
-    "body_invweight0",
-    "dof_invweight0",
-    "pair_friction",
-    "pair_solref",
-    "pair_solreffriction",
-)
-"""Fields of the model of which every candidate has its own."""
+AHEAD = 6
+"""Frames that ``start`` asks for: a device takes so many steps at once and makes who asks for more wait."""
+
+NOT_THERE = ("dof_M0",)
+"""Names of ``field_arrays`` that MJX-Warp does without."""
 
 
-def changed_fields(
-    model: mujoco.MjModel,
-    shapes: tuple[Shape, ...],
-    fields: ModelFields,
-    centre_of_mass: Float[np.ndarray, "batch objects 3"] | None = None,
-) -> dict[str, np.ndarray]:
-    """Arrays of a batch by the names of the model's fields, with a leading axis; the floor and the world stay as they are."""
-
-    def below(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-        return np.concatenate([np.broadcast_to(old[:1], (len(new), 1, *old.shape[1:])), new], 1)
-
-    mass, weight = fields.body_mass, fields.body_invweight0
-    half = half_extents(shapes, fields.geom_size)
-    boxes = np.stack([np.zeros_like(half), half], 2)
-    changed = {
-        "geom_size": below(model.geom_size, fields.geom_size),
-        "geom_rbound": below(model.geom_rbound, fields.geom_rbound),
-        "geom_aabb": below(model.geom_aabb.reshape(-1, 2, 3), boxes),
-        "body_mass": below(model.body_mass, mass),
-        "body_subtreemass": np.concatenate([mass.sum(1, keepdims=True), mass], 1),
-        "body_inertia": below(model.body_inertia, fields.body_inertia),
-        "body_invweight0": below(model.body_invweight0, weight),
-        "dof_invweight0": np.repeat(weight, 3, axis=-1).reshape(len(weight), -1),
-        "pair_friction": fields.pair_friction,
-        "pair_solref": fields.pair_solref,
-        "pair_solreffriction": fields.pair_solreffriction,
-    }
-    if centre_of_mass is not None:
-        changed["body_ipos"] = below(model.body_ipos, centre_of_mass)
+def changed_fields(model: mujoco.MjModel, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """``field_arrays`` of a batch as MJX-Warp's model has them: with the rows of the floor and the world."""
+    changed = {}
+    for name, values in arrays.items():
+        if name in ABOVE_FLOOR:
+            first = np.broadcast_to(getattr(model, name)[:1], (len(values), 1, *values.shape[2:]))
+            values = np.concatenate([first, values], 1)
+        if name not in NOT_THERE:
+            changed[name] = values.reshape(*values.shape[:2], 2, 3) if name == "geom_aabb" else values
     return changed
 
 
@@ -75,20 +46,22 @@ class Worlds:
 
     Args:
       model: of the scene kind.
+      batched: names of the model's arrays of which every candidate has its own.
       size: candidates.
       frames: of a trajectory.
       contacts: the most that a candidate can have.
-      off_centre: whether candidates have their own centres of mass.
       silent: bits of ``warn_overflow`` that are no news.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, size: int, frames: int, contacts: int, off_centre: bool = False, silent: int = 0
+        self, model: mujoco.MjModel, batched: Iterable[str], size: int, frames: int, contacts: int, silent: int = 0
     ):
         self.size, self.frames = size, frames
+        self.busy = False
+        """Whether a rollout has begun whose poses nobody has taken: not to be started again."""
+        self._left = 0
         self.device = wp.get_device()
         self._stream = wp.Stream(self.device) if self.device.is_cuda else None
-        batched = (*BATCHED, "body_ipos") if off_centre else BATCHED
         with self._here():
             self._model = engine.put_model(model, dict.fromkeys(batched, size))
             self._model.opt.gravity = wp.zeros(size, dtype=wp.vec3)
@@ -136,23 +109,29 @@ class Worlds:
         )
 
     def start(self, changed: dict[str, np.ndarray], gravity: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> None:
-        """Begins a rollout; ``finished`` waits for it.
+        """Begins a rollout; ``finished`` goes on with it and waits.
 
         Args:
-          changed: of ``changed_fields``, ``size`` rows.
+          changed: of ``changed_fields``, ``size`` rows each.
           gravity: (size, 3) [m/s^2].
           qpos, qvel: (size, nq), (size, nv).
         """
-        begin, advance = self._run
-        begin()
+        self.busy = True
+        self._run[0]()
         for name, values in changed.items():
             self._put(getattr(self._model, name), values)
         self._put(self._model.opt.gravity, gravity)
         self._put(self._data.qpos, qpos)
         self._put(self._data.qvel, qvel)
         self._keep_first()
-        for _ in range(self.frames - 1):
-            advance()
+        self._left = self.frames - 1
+        self._go_on(AHEAD)
+
+    def _go_on(self, frames: int) -> None:
+        frames = min(frames, self._left)
+        self._left -= frames
+        for _ in range(frames):
+            self._run[1]()
 
     def _keep_first(self) -> None:
         shape, inputs = self._data.qpos.shape, [self._frame, self._data.qpos, self._poses]
@@ -168,6 +147,7 @@ class Worlds:
 
     def finished(self) -> wp.array:
         """(size, frames, nq) on the device, until the next ``start``; waits without holding Python's lock."""
+        self._go_on(self._left)
         if self._stream is not None:
             wp.synchronize_stream(self._stream)
         return self._poses

@@ -49,7 +49,7 @@ def simulator(*shapes) -> MjxSimulator:
 def reference(*shapes) -> MujocoSimulator:
     """C MuJoCo whose solver goes on to the last digit."""
     made = MujocoSimulator(shapes, 30.0, threads=1)
-    made._models[0].opt.tolerance = 1e-14
+    made.model.opt.tolerance = 1e-14
     return made
 
 
