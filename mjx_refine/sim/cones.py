@@ -23,6 +23,9 @@ _CONE = wp.constant(int(_types.ConstraintState.CONE))
 _PAIRS = wp.constant(78)
 """Entries of the upper triangle of twelve degrees of freedom."""
 
+_LEAST = wp.constant(1.0e-15)
+"""MuJoCo's ``mjMINVAL``."""
+
 
 @wp.func
 def _involved(jacobian: wp.array3d(dtype=float), world: int, row: int, body: int) -> bool:
@@ -33,6 +36,78 @@ def _involved(jacobian: wp.array3d(dtype=float), world: int, row: int, body: int
         or jacobian[world, row, first + 1] != 0.0
         or jacobian[world, row, first + 2] != 0.0
     )
+
+
+@wp.func
+def _bodies(jacobian: wp.array3d(dtype=float), world: int, row: int, count: int) -> wp.vec2i:
+    """The one or two bodies that a contact moves; -1: none."""
+    first = int(-1)
+    second = int(-1)
+    for body in range(count):
+        if _involved(jacobian, world, row, body):
+            if first < 0:
+                first = body
+            else:
+                second = body
+    return wp.vec2i(first, second)
+
+
+@wp.func
+def _column(bodies: wp.vec2i, k: int) -> int:
+    """The k-th of the bodies' twelve degrees of freedom; -1 where there is no second body."""
+    body = bodies[0]
+    if k >= 6:
+        body = bodies[1]
+    return wp.where(body < 0, -1, 6 * body + k % 6)
+
+
+@wp.func
+def _row_of_pair(pair: int) -> int:
+    """j of the pair (i, j), i <= j, whose number is j (j + 1) / 2 + i; rounding of the root does not matter."""
+    j = int((wp.sqrt(8.0 * float(pair) + 1.0) - 1.0) * 0.5)
+    if (j + 1) * (j + 2) // 2 <= pair:
+        j += 1
+    if j * (j + 1) // 2 > pair:
+        j -= 1
+    return j
+
+
+@wp.func
+def _entry(
+    jacobian: wp.array3d(dtype=float),
+    residual: wp.array2d(dtype=float),
+    address: wp.array2d(dtype=int),
+    scale: _types.vec5,
+    mu: float,
+    world: int,
+    contact: int,
+    rows: int,
+    line: int,
+    column: int,
+) -> float:
+    """Of the cone's curvature, over its stiffness (``solver._elliptic_hessian_entry_from_projections``)."""
+    row = address[contact, 0]
+    a0 = mu * jacobian[world, row, line]
+    b0 = mu * jacobian[world, row, column]
+    slip = float(0.0)
+    along_a = float(0.0)
+    along_b = float(0.0)
+    across = float(0.0)
+    for k in range(1, rows):
+        at = address[contact, k]
+        if at >= 0:
+            u = residual[world, at] * scale[k - 1]
+            a = scale[k - 1] * jacobian[world, at, line]
+            b = scale[k - 1] * jacobian[world, at, column]
+            slip += u * u
+            along_a += u * a
+            along_b += u * b
+            across += a * b
+    length = wp.max(wp.sqrt(slip), _LEAST)
+    along_a /= length
+    along_b /= length
+    pull = mu * residual[world, row] * mu / length
+    return a0 * b0 - mu * (a0 * along_b + b0 * along_a) + pull * along_a * along_b + (mu * mu - pull) * across
 
 
 @wp.kernel
@@ -63,7 +138,6 @@ def cone_curvature(
     bodies = (tri_row[width - 1] + 1) // 6
     for item in range(block * width + element, wp.min(count[0], most) * _PAIRS, blocks * width):
         contact = item // _PAIRS
-        pair = item - contact * _PAIRS
         world = world_of[contact]
         if done[world] or dimension[contact] == 1 or distance[contact] - margin[contact] >= 0.0:
             continue
@@ -72,58 +146,20 @@ def cone_curvature(
             continue
         if state[world, row] != _CONE:
             continue
-        # The pair (i, j), i <= j < 12, number j (j + 1) / 2 + i.
-        j = int((wp.sqrt(8.0 * float(pair) + 1.0) - 1.0) * 0.5)
-        if (j + 1) * (j + 2) // 2 <= pair:
-            j += 1
-        if j * (j + 1) // 2 > pair:
-            j -= 1
-        i = pair - j * (j + 1) // 2
-        first = int(-1)
-        second = int(-1)
-        for body in range(bodies):
-            if _involved(jacobian, world, row, body):
-                if first < 0:
-                    first = body
-                else:
-                    second = body
-        if first < 0 or (j >= 6 and second < 0):
+        pair = item - contact * _PAIRS
+        j = _row_of_pair(pair)
+        both = _bodies(jacobian, world, row, bodies)
+        line = _column(both, pair - j * (j + 1) // 2)
+        column = _column(both, j)
+        if line < 0 or column < 0:
             continue
-        column = 6 * first + j
-        if j >= 6:
-            column = 6 * second + j - 6
-        line = 6 * first + i
-        if i >= 6:
-            line = 6 * second + i - 6
-
         scale = friction[contact]
         mu = scale[0] * impratio_invsqrt[world % impratio_invsqrt.shape[0]]
-        squared = mu * mu
-        stiffness = weight[world, row] / wp.max(squared * (1.0 + squared), 1.0e-15)
-        if stiffness == 0.0:
-            continue
-        a0 = mu * jacobian[world, row, line]
-        b0 = mu * jacobian[world, row, column]
-        slip = float(0.0)
-        along_a = float(0.0)
-        along_b = float(0.0)
-        across = float(0.0)
-        for k in range(1, dimension[contact]):
-            at = address[contact, k]
-            if at >= 0:
-                u = residual[world, at] * scale[k - 1]
-                a = scale[k - 1] * jacobian[world, at, line]
-                b = scale[k - 1] * jacobian[world, at, column]
-                slip += u * u
-                along_a += u * a
-                along_b += u * b
-                across += a * b
-        length = wp.max(wp.sqrt(slip), 1.0e-15)
-        along_a /= length
-        along_b /= length
-        pull = mu * residual[world, row] * mu / length
-        entry = a0 * b0 - mu * (a0 * along_b + b0 * along_a) + pull * along_a * along_b + (squared - pull) * across
-        wp.atomic_add(hessian, world, line, column, stiffness * entry)
+        stiffness = weight[world, row] / wp.max(mu * mu * (1.0 + mu * mu), _LEAST)
+        if stiffness != 0.0:
+            rows = dimension[contact]
+            entry = _entry(jacobian, residual, address, scale, mu, world, contact, rows, line, column)
+            wp.atomic_add(hessian, world, line, column, stiffness * entry)
 
 
 @contextlib.contextmanager
