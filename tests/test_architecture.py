@@ -21,7 +21,7 @@ LAYERS = (
     {"files"},
     {"scene"},
     {"rotations"},
-    {"batch", "observation", "compile_cache", "children"},
+    {"batch", "observation", "compile_cache", "children", "linear_algebra"},
     {"effects"},
     {"sim", "view", "space"},
     {"gradients"},

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import sys
 import threading
 from collections import deque
 from collections.abc import Generator, Sequence
@@ -14,6 +13,7 @@ from queue import SimpleQueue
 
 from mjx_refine.children import cores
 from mjx_refine.compile_cache import enable_cache
+from mjx_refine.linear_algebra import one_thread
 from mjx_refine.many.groups import Kind
 from mjx_refine.many.jobs import Job
 from mjx_refine.many.outcome import FAILED, Outcome
@@ -30,9 +30,6 @@ log = logging.getLogger("mjx_refine")
 
 AT_ONCE = 3
 """Groups that are searched side by side: while one waits for the device, the others think."""
-
-SWITCH = 1e-4
-"""Seconds after which a thread lets another one go on: MJX-Warp's steps are each begun by a call of Python."""
 
 
 class _Stopped(Exception):
@@ -65,8 +62,9 @@ class Batched:
         self.jobs = {job.name: job for job, _ in jobs}
         self.kinds = {job.name: kind for job, kind in jobs}
         self.parts = dict.fromkeys(self.jobs, 0.0)
-        # Kinds one after the other, so that the first can soon be searched; those that land fastest first.
-        order = sorted(dict.fromkeys(kind for _, kind in jobs), key=_weight)
+        # Kinds one after the other, so that the first can soon be searched; that whose search takes longest first, since the
+        # device has room for others beside it.
+        order = sorted(dict.fromkeys(kind for _, kind in jobs), key=_weight, reverse=True)
         self.to_land = deque(sorted(self.jobs, key=lambda name: order.index(self.kinds[name])))
         self.landed: dict[Kind, list[Prepared]] = {kind: [] for kind in order}
         self.unlanded = {kind: sum(k == kind for k in self.kinds.values()) for kind in order}
@@ -88,8 +86,10 @@ class Batched:
         Raises:
           RuntimeError: workers end before they begin.
         """
-        interval = sys.getswitchinterval()
-        sys.setswitchinterval(SWITCH)
+        with one_thread():
+            yield from self._outcomes()
+
+    def _outcomes(self) -> Generator[Outcome]:
         enable_cache()
         if has_accelerator():
             threading.Thread(target=self._warm_up, daemon=True).start()
@@ -108,7 +108,6 @@ class Batched:
                 self._show()
         finally:
             self.stop = True
-            sys.setswitchinterval(interval)
             for worker in self.workers:  # first all are told, so that they end side by side
                 worker.pipe.close()
             for worker in self.workers:

@@ -12,6 +12,7 @@ from mjx_refine.compile_cache import enable_cache
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.errors import InputError
 from mjx_refine.files import remove_stale_parts
+from mjx_refine.linear_algebra import one_thread
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Samples, Scene
 from mjx_refine.search.intervals import Intervals
@@ -71,7 +72,7 @@ def refine(
     began, compiled = time.monotonic(), _COMPILE["seconds"]
     samples = _as_samples(samples)
     enable_cache()
-    with on_host():
+    with on_host(), one_thread():
         problem = problem or Problem(samples, observation, options)
         checkpoint = None if folder is None else _made(Path(folder)) / CHECKPOINT
         run = Run(problem, progress or Progress(), checkpoint, resume)
