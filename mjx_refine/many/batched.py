@@ -29,7 +29,8 @@ from mjx_refine.sim.devices import has_accelerator
 log = logging.getLogger("mjx_refine")
 
 AT_ONCE = 3
-"""Groups that are searched side by side: while one waits for the device, the others think."""
+"""Groups that are searched side by side: while one waits for the device, the others think. Smaller groups that begin before all
+of a kind have landed are no gain: 64 mixed clips took 135 s by 8 clips, six groups at once, and 125 s by 21."""
 
 
 class _Stopped(Exception):

@@ -43,7 +43,7 @@ def _bodies(jacobian: wp.array3d(dtype=float), world: int, row: int, count: int)
     """The one or two bodies that a contact moves; -1: none."""
     first = int(-1)
     second = int(-1)
-    for body in range(count):
+    for body in range(count):  # a warp's threads read the same few numbers
         if _involved(jacobian, world, row, body):
             if first < 0:
                 first = body
@@ -137,29 +137,30 @@ def cone_curvature(
     width = tri_row.shape[0]
     bodies = (tri_row[width - 1] + 1) // 6
     for item in range(block * width + element, wp.min(count[0], most) * _PAIRS, blocks * width):
+        # What depends on nothing is read first, side by side: a thread waits for memory, not for arithmetic.
         contact = item // _PAIRS
         world = world_of[contact]
-        if done[world] or dimension[contact] == 1 or distance[contact] - margin[contact] >= 0.0:
-            continue
+        rows = dimension[contact]
         row = address[contact, 0]
-        if row < 0:
+        scale = friction[contact]
+        apart = distance[contact] - margin[contact]
+        if rows == 1 or apart >= 0.0 or row < 0:
             continue
-        if state[world, row] != _CONE:
+        shape = state[world, row]
+        stiff = weight[world, row]
+        mu = scale[0] * impratio_invsqrt[world % impratio_invsqrt.shape[0]]
+        both = _bodies(jacobian, world, row, bodies)
+        if done[world] or shape != _CONE or stiff == 0.0:
             continue
         pair = item - contact * _PAIRS
         j = _row_of_pair(pair)
-        both = _bodies(jacobian, world, row, bodies)
         line = _column(both, pair - j * (j + 1) // 2)
         column = _column(both, j)
         if line < 0 or column < 0:
             continue
-        scale = friction[contact]
-        mu = scale[0] * impratio_invsqrt[world % impratio_invsqrt.shape[0]]
-        stiffness = weight[world, row] / wp.max(mu * mu * (1.0 + mu * mu), _LEAST)
-        if stiffness != 0.0:
-            rows = dimension[contact]
-            entry = _entry(jacobian, residual, address, scale, mu, world, contact, rows, line, column)
-            wp.atomic_add(hessian, world, line, column, stiffness * entry)
+        entry = _entry(jacobian, residual, address, scale, mu, world, contact, rows, line, column)
+        stiff /= wp.max(mu * mu * (1.0 + mu * mu), _LEAST)
+        wp.atomic_add(hessian, world, line, column, stiff * entry)
 
 
 @contextlib.contextmanager
