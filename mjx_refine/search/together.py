@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
-import jax
 import numpy as np
 from mjx_fitness import Scores
 
@@ -229,4 +228,6 @@ def _parts(asked: list[Asked], most: int) -> list[list[Asked]]:
 
 
 def _memory_is_short(error: Exception) -> bool:
-    return isinstance(error, MemoryError | jax.errors.JaxRuntimeError) and "memory" in str(error).lower()
+    """As JAX ("out of memory") and Warp ("Failed to allocate ... bytes") say it."""
+    told = str(error).lower()
+    return isinstance(error, MemoryError | RuntimeError) and ("memory" in told or "failed to allocate" in told)

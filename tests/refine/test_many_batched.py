@@ -145,7 +145,10 @@ def test_one_that_fails_leaves_the_others(clips, tmp_path):
     assert [type(error) for error in errors] == [type(None), ValueError, type(None)]
 
 
-def test_a_batch_that_is_too_large_for_the_device_is_halved(clips, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "short", [MemoryError("out of memory"), RuntimeError("Failed to allocate 9000 bytes on device 'cuda:0'")]
+)
+def test_a_batch_that_is_too_large_for_the_device_is_halved(clips, tmp_path, monkeypatch, short):
     monkeypatch.setattr("mjx_refine.search.together.LEAST", 8)
     members = members_of(clips, tmp_path, dataclasses.replace(TINY, optimizer="cmaes"))
     ended, sizes = [], []
@@ -154,7 +157,7 @@ def test_a_batch_that_is_too_large_for_the_device_is_halved(clips, tmp_path, mon
         def rollout(self, batch, frames):
             sizes.append(len(batch))
             if len(batch) > 16:
-                raise MemoryError("out of memory")
+                raise short
             return super().rollout(batch, frames)
 
     Together(members, Small(("sphere",), 30.0, 1), lambda member, error: ended.append(error)).run()
