@@ -21,9 +21,10 @@ FEW_A_CORE = 24
 """Candidates in a batch for each core below which C MuJoCo is as fast as MJX-Warp on a GPU, where a few candidates take as
 long as thousands: box and cylinder, 16 cores and an H100: 128 candidates 71 and 204 ms, 1024 candidates 546 and 270."""
 
-QUICK = (5, 10)
-"""Newton and line-search iterations of MJX-Warp for a search: a batch waits for its slowest candidate. Box and cylinder, 64
-candidates against C after 1 s: median 4.9 mm, nine in ten below 13 mm; with 50 and 50 iterations 3.8 and 12 mm."""
+QUICK = (5, 4)
+"""Newton and line-search iterations of MJX-Warp for a search: a batch waits for its slowest candidate. 64 candidates against C
+after 0.6 s, median and nine in ten: box and cylinder 3.0 and 11 mm, with 50 and 50 iterations 2.5 and 11; four objects 11 and 34 for
+6 and 28. Ten line-search iterations are no closer, four of Newton's twice as far off."""
 
 OFFERED = "MJX_REFINE_OFFERED"
 """Environment variable: a backend that the process which searches has, where this one only prepares and finishes."""
