@@ -23,8 +23,8 @@ long as thousands: box and cylinder, 16 cores and an H100: 128 candidates 71 and
 
 QUICK = (5, 4)
 """Newton and line-search iterations of MJX-Warp for a search: a batch waits for its slowest candidate. 64 candidates against C
-after 0.6 s, median and nine in ten: box and cylinder 3.0 and 11 mm, with 50 and 50 iterations 2.5 and 11; four objects 11 and 34 for
-6 and 28. Ten line-search iterations are no closer, four of Newton's twice as far off."""
+after 0.6 s, median and nine in ten: box and cylinder 3.0 and 11 mm, with 50 and 50 iterations 2.5 and 11; four objects 11 and 34
+for 6 and 28. Ten line-search iterations are no closer, four of Newton's twice as far off."""
 
 OFFERED = "MJX_REFINE_OFFERED"
 """Environment variable: a backend that the process which searches has, where this one only prepares and finishes."""
