@@ -5,7 +5,10 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import sys
+import types
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
 
 ONE_THREAD = {
     "OMP_NUM_THREADS": "1",
@@ -42,3 +45,32 @@ def exit_with_parent(last: Callable[[], None] = lambda: None) -> None:
         parent.join()
         last()
         os._exit(1)
+
+
+@contextlib.contextmanager
+def pool(count: int, begin: Callable[..., None], arguments: tuple[object, ...] = ()) -> Iterator[ProcessPoolExecutor]:
+    """So many processes, each begun with ``begin(*arguments)``; whatever they are at when the block is left, they end.
+
+    They start when work is submitted, with this process's environment of that moment.
+    """
+    workers = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), begin, arguments)
+    try:
+        yield workers
+    finally:
+        mine = list((getattr(workers, "_processes", None) or {}).values())
+        workers.shutdown(wait=False, cancel_futures=True)
+        for process in mine:
+            process.terminate()
+        for process in mine:
+            process.join()
+
+
+@contextlib.contextmanager
+def without_main() -> Iterator[None]:
+    """Processes that start meanwhile do not import the caller's script, which then needs no guard against running again."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main

@@ -6,9 +6,13 @@ import dataclasses
 import time
 from collections.abc import Callable
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
+from mjx_refine.children import cores
+from mjx_refine.compile_cache import enable_cache
+from mjx_refine.diagnosis.crew import Crew, crew_of
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import HeldOut, held_out
 from mjx_refine.diagnosis.hypothesis import Term
@@ -20,6 +24,7 @@ from mjx_refine.diagnosis.store import Store
 from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, map_of, signs
 from mjx_refine.diagnosis.where import describe, misfit_map, places
 from mjx_refine.errors import InputError
+from mjx_refine.linear_algebra import one_thread
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Samples, Scene
 from mjx_refine.search.options import Options
@@ -55,18 +60,26 @@ def diagnose(
       observation: its clip.
       without: effects to leave out of the catalogue.
       seed: of everything random.
-      threads: of the simulator; all cores by default.
+      threads: cores at work, in threads of the simulator or in processes; all by default. The answer does not depend on it.
       told: called with a line for each step.
       store: where finished fits are kept, so that an interrupted call goes on; nowhere by default.
 
     Raises:
       InputError: the scene has effects, does not match the clip, nothing moves, or the clip is too short.
     """
+    enable_cache()
+    with one_thread(), jax.default_device(jax.devices("cpu")[0]), crew_of(threads or cores()) as crew:
+        return _diagnosed(crew, scene, observation, without, seed, threads, told or (lambda line: None), store)
+
+
+def _diagnosed(
+    crew: Crew, scene: Scene, observation: Observation, without, seed: int, threads, told, store
+) -> Diagnosis:
     began = time.monotonic()
-    told = told or (lambda line: None)
     problem, start, measured = prepared(scene, observation, threads)
     clip = ClipFit(problem.reference(scene.shapes), measured, observation.size, observation.length)
-    clip.store = store or clip.store
+    clip.store, clip.crew = store or clip.store, crew
+    crew.warm(clip)
     compared = compare(clip, start.scene, observation, start.matching, without, seed, told)
     told("held-out frames")
     best = best_candidate(compared)

@@ -32,11 +32,9 @@ def exchanged(clip: ClipFit, base: Fit, fitted: Fitted) -> tuple[Fit, Fitted]:
     count = base.hypothesis.dimension
     sources = [base.z, *(fitted[key][0].z[:count] for key in ordered[:SOURCES])]
     better = _again(clip, base, sources, count)
-    result = dict(fitted)
-    for key in ordered[:TAKERS]:
-        fit, promise = fitted[key]
-        result[key] = (_again(clip, fit, [better.z, *sources], count), promise)
-    return better, result
+    takers = ordered[:TAKERS]
+    fits = clip.crew.each(clip, _again, [(fitted[key][0], [better.z, *sources], count) for key in takers])
+    return better, {**fitted, **{key: (fit, fitted[key][1]) for key, fit in zip(takers, fits, strict=True)}}
 
 
 def _again(clip: ClipFit, fit: Fit, sources: list[np.ndarray], count: int) -> Fit:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -11,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.diagnosis.chaos import believed, drawn, jaggedness
+from mjx_refine.diagnosis.crew import Crew
 from mjx_refine.diagnosis.fitted import Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
@@ -18,10 +18,13 @@ from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, settl
 from mjx_refine.diagnosis.pace import DAMPINGS, STEPS, Pace, damped, updated
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.roam import GENERATIONS, ROAMED, Strategy
-from mjx_refine.diagnosis.slack import BIAS, Slack, impacts, kicked, slack_of, sustained, touching
+from mjx_refine.diagnosis.settled import Loose, Settled
+from mjx_refine.diagnosis.slack import Slack, impacts, kicked, slack_of, sustained, too_wide, touching
 from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
+from mjx_refine.scene import Shape
 from mjx_refine.search.landing import slowed
 from mjx_refine.sim.backends import Simulator
+from mjx_refine.sim.c import MujocoSimulator
 
 SCALE = 5.0
 """Noise widths beyond which residuals count ever less."""
@@ -32,21 +35,6 @@ PATIENCE = Parts(1.0, 1.0, 6.0, 1.0)
 WORTH, LITTLE_GAIN = 0.3, 0.002
 """A step by derivatives that were only updated is followed by another where it gains this part of the step before, and this
 part of the cost."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Loose:
-    """What may be off without being blamed.
-
-    Attributes:
-      always: whatever contacts do, one standard deviation a row.
-      kicks: errors of contacts, one standard deviation a row, or None.
-      blurred: the noise with what the uncertain moment of impacts adds, times a factor.
-    """
-
-    always: Parts
-    kicks: Parts | None
-    blurred: Callable[[float], Noise]
 
 
 class ClipFit:
@@ -68,11 +56,31 @@ class ClipFit:
         self.predictor = Predictor(simulator.shapes, measured.pixels, measured.places, image, simulator.fps)
         self.rollouts = 0.0
         self.counts = Counts()
-        self.store = Store()
+        self.store, self.crew = Store(), Crew()
         self.slackness = 1.0
         self._loose: Loose | None = None
         self._columns: np.ndarray | None = None
         self._slacks: dict[bytes | None, Slack] = {}
+
+    # --- in other processes -----------------------------------------------------------------------------------------
+    def again(self) -> Callable[[], ClipFit]:
+        """Makes the clip anew, in whatever process, with one thread."""
+        shapes, fps = self.simulator.shapes, self.simulator.fps
+        return functools.partial(_made, shapes, fps, self.measured, self.image, self.frames)
+
+    @property
+    def settled(self) -> Settled:
+        """All that residuals depend on beside the clip itself and the hypothesis."""
+        return Settled(self.measured, self.noise, self.counts, self._columns)
+
+    @settled.setter
+    def settled(self, told: Settled) -> None:
+        self.measured, self.noise, self.counts, self._columns = told.measured, told.noise, told.counts, told.columns
+        self._loose, self._slacks = None, {}
+
+    def warm(self) -> None:
+        """Compiles what predictions need."""
+        self.predictor.warm(self.frames)
 
     # --- what is kept of fits ---------------------------------------------------------------------------------------
     def state(self) -> str:
@@ -123,7 +131,7 @@ class ClipFit:
             moved = self.predictor(rows, many)
             kicks = Parts(*(part[~moved.bad] for part in self._change(moved, still)))
         marks = [(i.target, i.frame) for i in found]
-        self._loose = Loose(self._wide(), kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
+        self._loose = Loose(too_wide(self.measured), kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
         self.set_slackness(self.slackness)
         return len(found)
 
@@ -150,14 +158,6 @@ class ClipFit:
                 for a, b, measured in zip(moved.parts, still.parts, self.measured.parts, strict=True)
             )
         )
-
-    def _wide(self) -> Parts:
-        """Masks that are too wide by one standard deviation, a row an object [px]."""
-        parts = Parts(*(np.zeros((self.measured.reach.shape[1], *part.shape)) for part in self.measured.parts))
-        for n in range(len(parts.reach)):
-            parts.reach[n, :, n] = np.where(np.isfinite(self.measured.reach[:, n]), BIAS[0], 0.0)
-            parts.moments[n, :, n, 2] = np.where(np.isfinite(self.measured.moments[:, n, 2]), BIAS[1], 0.0)
-        return parts
 
     def settle_noise(self, fit: Fit) -> None:
         """Sets the noise to what changes from frame to frame in the residuals of a fit, which no smooth misfit does."""
@@ -394,3 +394,7 @@ class ClipFit:
         """No step, just what holds at ``z``."""
         base, _ = self.residuals(hypothesis, z[None], keep, scale)
         return self._finished(hypothesis, z, base[0], self.jacobian(hypothesis, z, base[0], keep, scale))
+
+
+def _made(shapes: tuple[Shape, ...], fps: float, measured: Measured, image: tuple[int, int], frames: int) -> ClipFit:
+    return ClipFit(MujocoSimulator(shapes, fps, 1), measured, image, frames)

@@ -60,8 +60,8 @@ def kept_frames(frames: int) -> Bool[np.ndarray, "frames"]:
 def held_out(clip: ClipFit, base: Fit, other: Fit | None) -> HeldOut:
     """Fits both on the kept frames, from where they ended on all, and looks at the others."""
     keep = kept_frames(clip.frames)
-    first = _outside(clip, base, keep)
-    second = first if other is None else _outside(clip, other, keep)
+    each = clip.crew.each(clip, _outside, [(fit, keep) for fit in (base, other) if fit is not None])
+    first, second = each[0], each[-1]
     seen = np.isfinite(clip.measured.reach).any((1, 2))
     frames = np.nonzero(~keep & seen)[0]
     if len(frames) == 0:

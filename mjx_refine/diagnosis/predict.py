@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -110,6 +111,15 @@ class Predictor:
             whole = changed_moments(whole, batch, view, change)
             flow = self._seen_flow(flow, batch, focal)
         return Prediction(reach, flow, whole, self._background(batch, len(poses), poses.shape[1]), bad)
+
+    def warm(self, frames: int) -> None:
+        """Compiles predictions of clips of so many frames."""
+        count, pixels = len(self.shapes), jnp.asarray(self.pixels, jnp.float32)
+        for drawn, size in itertools.product((True, False), SIZES):
+            poses = np.tile([0.0, 2.0, 0.5, 1.0, 0.0, 0.0, 0.0], (size, frames, count, 1))
+            place, angle = np.tile([0.0, -2.0, 4.0], (size, 1)), np.ones(size)
+            arrays = (poses, np.full((size, count, 3), 0.3), place, angle, angle)
+            _predict(self.shapes, tuple(jnp.asarray(a, jnp.float32) for a in arrays), pixels, self.image, drawn)
 
     def _seen_flow(self, flow: np.ndarray, batch: SceneBatch, focal: np.ndarray) -> np.ndarray:
         here = np.broadcast_to(self.pixels[None, :-1], flow.shape)

@@ -38,13 +38,18 @@ def replays(clip: ClipFit, fits: list[Fit], problem: Problem, matching: tuple[in
       matching: mask id of each object.
     """
     clip.forget_slack(everywhere(clip.measured, clip.frames))
-    return [_replay(clip, fit, problem, matching) for fit in fits]
+    found = clip.crew.each(clip, _rigid, [(fit,) for fit in fits])
+    return [_replay(clip, fit, z, problem, matching) for fit, z in zip(fits, found, strict=True)]
 
 
-def _replay(clip: ClipFit, fit: Fit, problem: Problem, matching: tuple[int, ...]) -> Replay:
+def _rigid(clip: ClipFit, fit: Fit) -> np.ndarray:
+    held = _held(fit)
+    return clip.fit(held, fit.z[: held.dimension], ITERATIONS).z
+
+
+def _replay(clip: ClipFit, fit: Fit, rigid: np.ndarray, problem: Problem, matching: tuple[int, ...]) -> Replay:
     held = _held(fit)
     here, given = fit.z[: held.dimension], np.zeros(held.dimension)
-    rigid = clip.fit(held, here, ITERATIONS).z
     scenes = [held.scene(z, clip.frames) for z in (rigid, here, given)]
     scores = problem.score(scenes, matching)
     best = int(np.argmax(np.nan_to_num(scores.fitness, nan=-np.inf)))

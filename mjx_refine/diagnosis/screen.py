@@ -64,25 +64,22 @@ class Screen:
       clip: the clip's residuals.
       fit: where to look from.
       view: what kinds need to know to propose starts.
+      scale: of the robust loss that the fit was made with [noise widths].
+      poses: of the fit, where they are known.
     """
 
-    def __init__(self, clip: ClipFit, fit: Fit, view: FitView, scale: float = SCALE):
+    def __init__(self, clip: ClipFit, fit: Fit, view: FitView, scale: float = SCALE, poses: np.ndarray | None = None):
         self.clip, self.fit, self.view, self.scale = clip, fit, view, scale
         self.inverse = np.linalg.inv(fit.curvature)
-        self.poses = clip.poses(fit.hypothesis, fit.z[None])
+        self.poses = clip.poses(fit.hypothesis, fit.z[None]) if poses is None else poses
 
     def leads(self, names: list[str]) -> list[Lead]:
         """The best few starts of every effect and target, most promising first."""
-        found: list[Lead] = []
-        for name in names:
-            kind = catalogue()[name]
-            for target in range(len(self.view.batch.shapes)) if kind.targeted else (-1,):
-                found += self._family(kind, target)
+        targets = range(len(self.view.batch.shapes))
+        families = [(name, t) for name in names for t in (targets if catalogue()[name].targeted else (-1,))]
+        rows = [(self.fit, self.view, self.scale, self.poses, *family) for family in families]
+        found = [lead for leads in self.clip.crew.each(self.clip, _family, rows) for lead in leads]
         return sorted(found, key=lambda lead: -lead.gain)
-
-    def _family(self, kind: EffectKind, target: int) -> list[Lead]:
-        starts = kind.starts(self.view, target)
-        return self.looked(kind, target, starts) if starts else []
 
     def looked(self, kind: EffectKind, target: int, starts: list[Start]) -> list[Lead]:
         """The best few of some starts of one effect and target."""
@@ -154,6 +151,14 @@ class Screen:
         gradient = before + fit.jacobian.T @ (white - fit.residual)
         now = fit.cost - fit.data + 0.5 * float(white @ white) - 0.5 * float(gradient @ self.inverse @ gradient)
         return fit.cost - 0.5 * float(before @ self.inverse @ before) - now, -self.inverse @ gradient
+
+
+def _family(
+    clip: ClipFit, fit: Fit, view: FitView, scale: float, poses: np.ndarray, name: str, target: int
+) -> list[Lead]:
+    kind = catalogue()[name]
+    starts = kind.starts(view, target)
+    return Screen(clip, fit, view, scale, poses).looked(kind, target, starts) if starts else []
 
 
 def distinct(leads: list[Lead], most: int = 3) -> list[Lead]:

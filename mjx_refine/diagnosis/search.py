@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from mjx_refine.diagnosis.base import base_space, stored_base
-from mjx_refine.diagnosis.exchange import exchanged
+from mjx_refine.diagnosis.exchange import Fitted, Key, exchanged
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.fitted import Explained
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
@@ -134,22 +135,22 @@ def compare(
 def _singles(
     clip: ClipFit, base: Fit, names, scene, observation, masks_of, seed: int, told: Told
 ) -> tuple[Fit, tuple[Candidate, ...]]:
-    fitted: dict[tuple[str, int], tuple[Fit, float]] = {}
+    fitted: Fitted = {}
     zero = clip.at(base.hypothesis, np.zeros(base.hypothesis.dimension), scale=FORGIVING)
     for again in range(2):
         told("looking ahead")
         view = view_of(clip, base, observation, masks_of)
         chosen = chosen_of(Screen(clip, base, view).leads(names), FAMILIES if again == 0 else 3)
-        for lead in chosen:
-            told(f"{lead.name} {target_name(scene.names, lead.target)}".strip())
-            _fit_lead(clip, base, lead, fitted)
+        rows = [(base, lead) for lead in chosen]
         if again == 0:
             # The base model's fit has bent its parameters towards the effect; from the given scene the way is straight.
             given = Screen(clip, zero, view_of(clip, zero, observation, masks_of), FORGIVING).leads(names)
-            for lead in chosen_of(given, FRESH, 1):
-                told(f"{lead.name} {target_name(scene.names, lead.target)}".strip())
-                _fit_lead(clip, zero, lead, fitted)
-        _walls_from_pushes(clip, base, fitted, names, view, told)
+            rows += [(zero, lead) for lead in chosen_of(given, FRESH, 1)]
+        lines = [f"{lead.name} {target_name(scene.names, lead.target)}".strip() for _, lead in rows]
+        for (_, lead), fit in zip(rows, clip.crew.each(clip, _fit_lead, rows, told, lines), strict=True):
+            _keep(fitted, (lead.name, lead.target), fit, lead.gain)
+        if "hidden_obstacle" in names:
+            _walls_from_pushes(clip, base, fitted, view, told)
         best = max((fit for fit, _ in fitted.values()), key=lambda fit: fit.evidence, default=base)
         # What an effect's fit found for the base parameters may serve the base model as well.
         other = clip.fit(base.hypothesis, best.z[: base.hypothesis.dimension], 8) if fitted else base
@@ -157,13 +158,23 @@ def _singles(
             break
         base = other
     base, fitted = exchanged(clip, base, fitted)
-    for key in sorted(fitted, key=lambda key: -fitted[key][0].evidence)[:ROAMING]:
-        fit, promise = fitted[key]
-        if _lead(fit, base) > HOPELESS:
-            fitted[key] = (clip.roam(clip.fit(fit.hypothesis, fit.z, 8), seed, ROAMED_AGAIN), promise)
+    first = sorted(fitted, key=lambda key: -fitted[key][0].evidence)[:ROAMING]
+    first = [key for key in first if _lead(fitted[key][0], base) > HOPELESS]
+    for key, fit in zip(first, clip.crew.each(clip, _roamed, [(fitted[key][0], seed) for key in first]), strict=True):
+        fitted[key] = (fit, fitted[key][1])
     base, fitted = exchanged(clip, base, fitted)
     finals = [Candidate(fit, _lead(fit, base), promise) for fit, promise in fitted.values()]
     return base, tuple(sorted(finals, key=lambda c: -c.lead))
+
+
+def _keep(fitted: Fitted, key: Key, fit: Fit, promise: float) -> None:
+    """Keeps a fit where it is its family's best."""
+    if key not in fitted or fit.evidence > fitted[key][0].evidence:
+        fitted[key] = (fit, promise)
+
+
+def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
+    return clip.roam(clip.fit(fit.hypothesis, fit.z, 8), seed, ROAMED_AGAIN)
 
 
 def _lead(fit: Fit, base: Fit) -> float:
@@ -182,8 +193,8 @@ def chosen_of(leads: list[Lead], families: int, starts: int = 2) -> list[Lead]:
     return [lead for family in best for lead in family]
 
 
-def _fit_lead(clip: ClipFit, here: Fit, lead: Lead, fitted: dict) -> None:
-    """Fits a lead from where it was seen, and keeps it where it is the family's best."""
+def _fit_lead(clip: ClipFit, here: Fit, lead: Lead) -> Fit:
+    """Fits a lead from where it was seen."""
     one = lead.term(clip.frames)
     hypothesis = here.hypothesis.added(one)
     z = _begin(clip, hypothesis, here, lead, lead.z(one))
@@ -193,9 +204,7 @@ def _fit_lead(clip: ClipFit, here: Fit, lead: Lead, fitted: dict) -> None:
     if fit.cost > here.cost and here.z.any():
         # Where the linear look misleads, the effect grows from nothing.
         fit = clip.fit(hypothesis, np.concatenate([here.z, 0 * lead.z(one)]), 9)
-    key = (lead.name, lead.target)
-    if key not in fitted or fit.evidence > fitted[key][0].evidence:
-        fitted[key] = (fit, lead.gain)
+    return fit
 
 
 def _begin(clip: ClipFit, hypothesis: Hypothesis, base: Fit, lead: Lead, z: np.ndarray) -> np.ndarray:
@@ -205,18 +214,15 @@ def _begin(clip: ClipFit, hypothesis: Hypothesis, base: Fit, lead: Lead, z: np.n
     return clip.best_of(hypothesis, np.array([np.concatenate([base.z + a * limited, a * z]) for a in parts]))
 
 
-def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: dict, names, view: FitView, told: Told) -> None:
+def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: Fitted, view: FitView, told: Told) -> None:
     """An obstacle begins where a push was found."""
-    if "hidden_obstacle" not in names:
-        return
-    for (name, target), (fit, promise) in list(fitted.items()):
-        if name != "push" or fit.evidence < base.evidence + 3.0:
-            continue
-        told("hidden_obstacle")
-        wall = _wall_from_push(clip, fit, view)
-        key = ("hidden_obstacle", target)
-        if wall is not None and (key not in fitted or wall.evidence > fitted[key][0].evidence):
-            fitted[key] = (wall, promise)
+    pushes = [(target, *found) for (name, target), found in fitted.items() if name == "push"]
+    pushes = [row for row in pushes if row[1].evidence >= base.evidence + 3.0]
+    rows = [(fit, view) for _, fit, _ in pushes]
+    walls = clip.crew.each(clip, _wall_from_push, rows, told, ["hidden_obstacle"] * len(rows))
+    for (target, _, promise), wall in zip(pushes, walls, strict=True):
+        if wall is not None:
+            _keep(fitted, ("hidden_obstacle", target), wall, promise)
 
 
 def _wall_from_push(clip: ClipFit, fit: Fit, view: FitView) -> Fit | None:
@@ -239,33 +245,40 @@ def _pairs(
     clip: ClipFit, base: Fit, singles, names, observation, masks_of, seed: int, told: Told
 ) -> tuple[Candidate, ...]:
     """Forward selection of a second effect beside the best one or two."""
-    found: list[Candidate] = []
-    for first in singles[:2]:
-        if first.lead < 15.0:
-            break
+    beside: list[tuple[Candidate, FitView, Lead]] = []
+    for first in itertools.takewhile(lambda one: one.lead >= 15.0, singles[:2]):
         view = view_of(clip, first.fit, observation, masks_of)
         leads = Screen(clip, first.fit, view).leads(
             [n for n in names if n not in first.names or catalogue()[n].targeted]
         )
         leads = [x for x in leads if (x.name, x.target) not in set(zip(first.names, first.targets, strict=True))]
         # Three effects, not three moments of one push.
-        chosen = [x for x in chosen_of(leads, 3, 1) if x.gain > SECOND_PROMISE]
-        for lead in chosen:
-            told(f"{first.names[0]} and {lead.name}")
-            one = lead.term(clip.frames)
-            hypothesis = first.fit.hypothesis.added(one)
-            fit = clip.fit(hypothesis, _begin(clip, hypothesis, first.fit, lead, lead.z(one)), 7)
-            found.append(Candidate(fit, _lead(fit, base), lead.gain))
-            if lead.name == "push" and "hidden_obstacle" in names and found[-1].lead > first.lead:
-                told(f"{first.names[0]} and hidden_obstacle")
-                wall = _wall_from_push(clip, fit, view)
-                if wall is not None:
-                    found.append(Candidate(wall, _lead(wall, base), lead.gain))
+        beside += [(first, view, x) for x in chosen_of(leads, 3, 1) if x.gain > SECOND_PROMISE]
+    lines = [f"{first.names[0]} and {lead.name}" for first, _, lead in beside]
+    fits = clip.crew.each(clip, _second, [(first.fit, lead) for first, _, lead in beside], told, lines)
+    found = [Candidate(fit, _lead(fit, base), lead.gain) for fit, (_, _, lead) in zip(fits, beside, strict=True)]
+    pushed = [
+        (one, view)
+        for one, (first, view, lead) in zip(found, beside, strict=True)
+        if lead.name == "push" and "hidden_obstacle" in names and one.lead > first.lead
+    ]
+    lines = [f"{one.names[0]} and hidden_obstacle" for one, _ in pushed]
+    walls = clip.crew.each(clip, _wall_from_push, [(one.fit, view) for one, view in pushed], told, lines)
+    for wall, (one, _) in zip(walls, pushed, strict=True):
+        if wall is not None:
+            found.append(Candidate(wall, _lead(wall, base), one.promise))
     found.sort(key=lambda c: -c.lead)
     if found and found[0].lead > singles[0].lead:
         fit = clip.roam(found[0].fit, seed, ROAMED_AGAIN)
         found[0] = dataclasses.replace(found[0], fit=fit, lead=_lead(fit, base))
     return tuple(found)
+
+
+def _second(clip: ClipFit, first: Fit, lead: Lead) -> Fit:
+    """The fit with one more effect."""
+    one = lead.term(clip.frames)
+    hypothesis = first.hypothesis.added(one)
+    return clip.fit(hypothesis, _begin(clip, hypothesis, first, lead, lead.z(one)), 7)
 
 
 def _again(
@@ -281,12 +294,14 @@ def _again(
             break
     clip.allow_chaos(best, seed)
     impacts = clip.allow_slack(base)
-    base = clip.fit(base.hypothesis, base.z, 10)
-    found = []
-    for one in singles[:KEPT]:
-        fit = clip.fit(one.fit.hypothesis, one.fit.z, 8)
-        found.append(dataclasses.replace(one, fit=fit, lead=_lead(fit, base)))
+    rows = [(base, 10), *((one.fit, 8) for one in singles[:KEPT])]
+    base, *fits = clip.crew.each(clip, _refitted, rows)
+    found = [dataclasses.replace(one, fit=fit, lead=_lead(fit, base)) for one, fit in zip(singles, fits, strict=False)]
     return base, tuple(sorted(found, key=lambda c: -c.lead)), impacts
+
+
+def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:
+    return clip.fit(fit.hypothesis, fit.z, iterations)
 
 
 def target_name(names: tuple[str, ...], target: int) -> str:

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch, concatenate
+from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.sim.backends import Simulator
 from mjx_refine.sim.model import SUBSTEPS
 from mjx_refine.space.layout import lowest_extent
@@ -82,6 +83,15 @@ def slack_of(columns: Float[np.ndarray, "residuals columns"]) -> Slack:
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
     felt = size > FELT
     return Slack(np.ascontiguousarray(basis[:, felt]), 1.0 - 1.0 / np.sqrt(1.0 + size[felt] ** 2))
+
+
+def too_wide(measured: Measured) -> Parts:
+    """Masks that are too wide by one standard deviation, a row an object [px]."""
+    parts = Parts(*(np.zeros((measured.reach.shape[1], *part.shape)) for part in measured.parts))
+    for n in range(len(parts.reach)):
+        parts.reach[n, :, n] = np.where(np.isfinite(measured.reach[:, n]), BIAS[0], 0.0)
+        parts.moments[n, :, n, 2] = np.where(np.isfinite(measured.moments[:, n, 2]), BIAS[1], 0.0)
+    return parts
 
 
 def impacts(batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], fps: float) -> list[Impact]:

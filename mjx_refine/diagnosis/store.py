@@ -77,6 +77,25 @@ class Store:
         return None if self.folder is None else self.folder / f"fit_{key}.npz"
 
 
+@dataclasses.dataclass
+class Borrowed(Store):
+    """Another process's folder: fits are read in it, and those that are made are handed over.
+
+    Attributes:
+      made: (key, arrays) of each.
+    """
+
+    made: list[tuple[str, Arrays]] = dataclasses.field(default_factory=list)
+
+    def __post_init__(self):
+        """Leaves alone what others are writing."""
+
+    def keep(self, key: str, arrays: Mapping[str, np.ndarray]) -> None:
+        """Puts arrays aside."""
+        if self.folder is not None:
+            self.made.append((key, dict(arrays)))
+
+
 def versions() -> str:
     """A fingerprint of what makes fits: the package's own code and the engines under it."""
     root = Path(__file__).parent.parent

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
-import multiprocessing
 import os
 import signal
 import threading
@@ -13,7 +12,7 @@ from collections.abc import Generator, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
-from mjx_refine.children import ONE_THREAD, exit_with_parent, inherited
+from mjx_refine.children import ONE_THREAD, exit_with_parent, inherited, pool
 from mjx_refine.errors import InputError
 from mjx_refine.generate.make import Maker, Tally
 from mjx_refine.generate.options import GenerateOptions
@@ -64,26 +63,18 @@ def worked(jobs: list[Job], workers: int, environment: Mapping[str, str]) -> Gen
         for job in jobs:
             yield _write(job, maker)
         return
-    context, beside = multiprocessing.get_context("spawn"), set(multiprocessing.active_children())
-    pool = concurrent.futures.ProcessPoolExecutor(workers, context, _begin, (jobs[0],))
     try:
-        with inherited({**SHARED, **environment}):
-            futures = [pool.submit(_work, job) for job in jobs]
-        for future in concurrent.futures.as_completed(futures):
-            yield future.result()
-        pool.shutdown()
+        with pool(workers, _begin, (jobs[0],)) as processes:
+            with inherited({**SHARED, **environment}):
+                futures = [processes.submit(_work, job) for job in jobs]
+            for future in concurrent.futures.as_completed(futures):
+                yield future.result()
+            processes.shutdown()
     except BrokenProcessPool as error:
         raise RuntimeError(
             "a worker process ended: was memory short (choose fewer --workers), or does a script call generate_scenes "
             "without `if __name__ == '__main__':` around it?"
         ) from error
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        mine = set(multiprocessing.active_children()) - beside
-        for process in mine:
-            process.terminate()
-        for process in mine:
-            process.join()
 
 
 _MAKERS: dict[GenerateOptions, Maker] = {}

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from mjx_refine.diagnosis.chaos import DRAWS, EXCUSED, believed, drawn, jaggedness
+from mjx_refine.diagnosis.crew import Crew
 from mjx_refine.diagnosis.exchange import exchanged
 from mjx_refine.diagnosis.fitted import Fit
 from mjx_refine.diagnosis.measure import Parts
@@ -106,6 +107,9 @@ class _Bowl:
 
 class _Stuck:
     """Least squares that stays where it begins."""
+
+    rollouts = 0.0
+    crew = Crew()
 
     def residuals(self, hypothesis, points):
         return None, ((points - np.array(hypothesis.bottom)) ** 2).sum(1) + 1.0

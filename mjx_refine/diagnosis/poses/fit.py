@@ -14,12 +14,13 @@ from jaxtyping import Bool, Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
-from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit, Loose
+from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import BLUR, Counts, Noise
 from mjx_refine.diagnosis.pace import STEPS
 from mjx_refine.diagnosis.poses.data import Poses, noise_of, rotation_vector
 from mjx_refine.diagnosis.predict import Prediction
+from mjx_refine.diagnosis.settled import Loose
 from mjx_refine.diagnosis.slack import Impact, impacts, kicked, sustained, touching
 from mjx_refine.diagnosis.store import fingerprint
 from mjx_refine.search.landing import slowed
