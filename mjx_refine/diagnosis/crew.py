@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 
@@ -29,31 +29,6 @@ log = logging.getLogger("mjx_refine")
 
 MOST = 16
 """Processes: hardly ever are there more pieces at a time, and each takes some hundred megabytes."""
-
-
-class Clip(Protocol):
-    """What is fitted, see ``ClipFit``."""
-
-    rollouts: float
-    store: Store
-    settled: Settled
-
-    @property
-    def facts(self) -> str:
-        """A fingerprint of the clip."""
-        ...
-
-    def state(self) -> str:
-        """A fingerprint of the clip and of what is settled."""
-        ...
-
-    def again(self) -> Callable[[], Any]:
-        """Makes the clip anew, in whatever process, with one thread."""
-        ...
-
-    def warm(self) -> None:
-        """Compiles what predictions need."""
-        ...
 
 
 Piece = Callable[..., Any]
@@ -80,7 +55,7 @@ class _Order:
     settled: Settled
 
     @classmethod
-    def of(cls, clip: Clip) -> _Order:
+    def of(cls, clip: Any) -> _Order:
         return cls(clip.facts, clip.state(), clip.again(), clip.settled)
 
 
@@ -107,15 +82,17 @@ class Crew:
     def __init__(self, others: ProcessPoolExecutor | None = None, count: int = 0):
         self._others, self._count, self._bench = others, count, _Bench()
 
-    def warm(self, clip: Clip) -> None:
+    def warm(self, clip: Any) -> None:
         """Lets the other processes compile what they will need, while this one goes on."""
-        with contextlib.suppress(RuntimeError):
-            for _ in range(self._count if self._others else 0):
-                self._others.submit(_warm, _Order.of(clip))  # type: ignore[union-attr]
+        if self._others is not None:
+            order = _Order.of(clip)
+            with contextlib.suppress(RuntimeError):
+                for _ in range(self._count):
+                    self._others.submit(_warm, order)
 
     def each(
         self,
-        clip: Clip,
+        clip: Any,
         piece: Piece,
         rows: Sequence[tuple[Any, ...]],
         told: Callable[[str], None] | None = None,
@@ -124,7 +101,7 @@ class Crew:
         """``piece(clip, *row)`` of every row, in their order.
 
         Args:
-          clip: its rollouts are counted, and its store keeps what was fitted.
+          clip: a ``ClipFit``; its rollouts are counted, and its store keeps what was fitted.
           piece: a function of a module.
           rows: arguments, small against the work.
           told: is called with the line of a piece that begins here, or has come from elsewhere.
@@ -145,7 +122,7 @@ class Crew:
         clip.rollouts += sum(one.rollouts for one in done)
         return [one.result for one in done]
 
-    def _side_by_side(self, others, clip: Clip, piece: Piece, rows, say: Callable[[int], None]) -> list[_Done]:
+    def _side_by_side(self, others, clip: Any, piece: Piece, rows, say: Callable[[int], None]) -> list[_Done]:
         order, folder = _Order.of(clip), clip.store.folder
         left, arrived = iter(range(len(rows))), queue.SimpleQueue()
         done: dict[int, _Done] = {}
