@@ -41,7 +41,7 @@ UNFINISHED = "unfinished"
 @click.option("--out", type=_PATH, required=True, help="Folder for the results.")
 @click.option("--seed", type=click.IntRange(0, 2**32 - 1), default=0, show_default=True, help="Of everything random.")
 @click.option("--without", multiple=True, metavar="EFFECT", help="An effect to leave out; may be given again.")
-@click.option("--threads", type=click.IntRange(1, 4096), help="Of the simulation; all cores by default.")
+@click.option("--threads", type=click.IntRange(1, 4096), help="Cores at work; all by default. The answer is the same.")
 @click.option("--resume", is_flag=True, help="Go on from what an interrupted run of this very call left in --out.")
 @click.pass_context
 def diagnose(context: click.Context, init, video, poses, out: Path, seed: int, without, threads, resume: bool) -> None:
