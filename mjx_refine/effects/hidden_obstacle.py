@@ -38,7 +38,7 @@ class HiddenObstacle(EffectKind):
         normal, arm, depth = _met(motion, target, values)
         if not (depth > 0).any():
             return None
-        velocity = motion.velocity[:, target] + np.cross(motion.spin[:, target], arm)
+        velocity = motion.velocity[:, target] + rotations.cross(motion.spin[:, target], arm)
         approach = -(velocity * normal).sum(-1)
         damping = damping_of(values[:, 2], motion.step)
         # A body that starts behind the wall is not thrown out of it.
@@ -49,7 +49,7 @@ class HiddenObstacle(EffectKind):
             motion.batch.friction[:, target, :1] * slip / np.maximum(np.linalg.norm(slip, axis=-1, keepdims=True), 0.05)
         )
         force = size[:, None] * (normal - grip)
-        return of_target(motion.batch, target, force), of_target(motion.batch, target, np.cross(arm, force))
+        return of_target(motion.batch, target, force), of_target(motion.batch, target, rotations.cross(arm, force))
 
     def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
         gap = -_met(motion, target, values)[2]

@@ -328,4 +328,5 @@ def glance(motion: Motion, gap: float) -> float:
     """For how long no body can cover ``gap`` [m], surely [s]."""
     speed = np.linalg.norm(motion.velocity, axis=-1)
     rim = np.linalg.norm(motion.spin, axis=-1) * np.linalg.norm(motion.batch.size, axis=-1)
-    return min(gap / (float(np.nan_to_num((speed + rim).max(), nan=0.0)) + GAIN), GLANCE)
+    fastest = float((speed + rim).max())
+    return min(gap / ((0.0 if np.isnan(fastest) else fastest) + GAIN), GLANCE)

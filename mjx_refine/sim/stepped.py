@@ -44,24 +44,29 @@ def stepped_rollout(
     current, warm = usual.copy(), np.zeros((count, models[0].nv))
     result = np.empty((count, frames - 1, positions))
     spec = mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
+    centre = acting.centre_of_mass(batch)
     k, last = 0, (frames - 1) * SUBSTEPS
     while k < last:
         motion = _motion(state, batch, k * step, step, world)
-        idle = np.nan_to_num(acting.idle(batch, motion), posinf=1e3)
-        steps = int(np.clip(idle // step, 1, last - k))
-        told = _about_the_mass(acting.loads(batch, motion), motion, acting.centre_of_mass(batch))
+        idle = acting.idle(batch, motion)
+        steps = 1 if np.isnan(idle) else int(np.clip(min(idle, 1e3) // step, 1, last - k))
+        told = _about_the_mass(acting.loads(batch, motion), motion, centre)
         applied[:] = 0.0
         if told is not None:
             for part, load in enumerate(told):
                 turned = load if world is None else np.einsum("bji,bnj->bni", world, load)
-                applied[:, 0, 1:, 3 * part : 3 * part + 3] = np.nan_to_num(turned)
+                applied[:, 0, 1:, 3 * part : 3 * part + 3] = turned
+            if not np.isfinite(applied).all():
+                np.nan_to_num(applied, copy=False)
         friction = acting.floor_friction(batch, motion)
         if friction is not None:
             wanted = np.where(np.isnan(friction), usual, friction)
             for row in np.nonzero((wanted != current).any(1))[0]:
                 models[row].pair_friction[:objects, :2] = wanted[row, :, None]
             current = wanted
-        states, _ = pool.rollout(
+        # Checks of shapes would take as long as a step.
+        states, nothing = np.empty((count, steps, state.shape[1])), np.empty((count, steps, 0))
+        pool.rollout(
             models,
             data,
             state,
@@ -69,9 +74,10 @@ def stepped_rollout(
             control_spec=spec,
             nstep=steps,
             initial_warmstart=warm,
-            skip_checks=False,
+            state=states,
+            sensordata=nothing,
+            skip_checks=True,
         )
-        states = np.asarray(states)
         ends = np.arange(-(-(k + 1) // SUBSTEPS) * SUBSTEPS, k + steps + 1, SUBSTEPS)
         result[:, ends // SUBSTEPS - 1] = states[:, ends - k - 1, 1 : 1 + positions]
         state, k = states[:, -1].copy(), k + steps
@@ -85,7 +91,7 @@ def _about_the_mass(told: Loads | None, motion: Motion, centre: np.ndarray | Non
     if told is None or centre is None:
         return told
     force, torque = told
-    return force, torque - np.cross(rotations.rotate(motion.quaternion, centre), force)
+    return force, torque - rotations.cross(rotations.rotate(motion.quaternion, centre), force)
 
 
 def _motion(state: np.ndarray, batch: SceneBatch, time: float, step: float, world: np.ndarray | None) -> Motion:
