@@ -47,16 +47,17 @@ class _Done:
 
 @dataclasses.dataclass(frozen=True)
 class _Order:
-    """What a process must know of a clip to do pieces."""
+    """What a process must know of a clip to do pieces, and how many threads it has for them."""
 
     facts: str
     state: str
-    make: Callable[[], Any]
+    make: Callable[[int], Any]
     settled: Settled
+    threads: int
 
     @classmethod
-    def of(cls, clip: Any) -> _Order:
-        return cls(clip.facts, clip.state(), clip.again(), clip.settled)
+    def of(cls, clip: Any, threads: int = 1) -> _Order:
+        return cls(clip.facts, clip.state(), clip.again(), clip.settled, threads)
 
 
 class _Bench:
@@ -64,12 +65,12 @@ class _Bench:
 
     def __init__(self):
         self.clip: Any = None
-        self.facts = self.state = ""
+        self.made, self.state = ("", 0), ""
 
     def fetch(self, order: _Order) -> Any:
         """The clip as ordered, not yet counted or stored anything for."""
-        if self.facts != order.facts:
-            self.clip, self.facts, self.state = order.make(), order.facts, ""
+        if self.made != (order.facts, order.threads):
+            self.clip, self.made, self.state = order.make(order.threads), (order.facts, order.threads), ""
         if self.state != order.state:
             self.clip.settled, self.state = order.settled, order.state
         self.clip.rollouts = 0.0
@@ -123,7 +124,8 @@ class Crew:
         return [one.result for one in done]
 
     def _side_by_side(self, others, clip: Any, piece: Piece, rows, say: Callable[[int], None]) -> list[_Done]:
-        order, folder = _Order.of(clip), clip.store.folder
+        # Where there are fewer pieces than processes, each has the cores of several.
+        order, folder = _Order.of(clip, max(1, (self._count + 1) // len(rows))), clip.store.folder
         left, arrived = iter(range(len(rows))), queue.SimpleQueue()
         done: dict[int, _Done] = {}
 

@@ -63,8 +63,8 @@ class ClipFit:
         self._slacks: dict[bytes | None, Slack] = {}
 
     # --- in other processes -----------------------------------------------------------------------------------------
-    def again(self) -> Callable[[], ClipFit]:
-        """Makes the clip anew, in whatever process, with one thread."""
+    def again(self) -> Callable[[int], ClipFit]:
+        """Makes the clip anew, in whatever process, with so many threads."""
         shapes, fps = self.simulator.shapes, self.simulator.fps
         return functools.partial(_made, shapes, fps, self.measured, self.image, self.frames)
 
@@ -396,5 +396,5 @@ class ClipFit:
         return self._finished(hypothesis, z, base[0], self.jacobian(hypothesis, z, base[0], keep, scale))
 
 
-def _made(shapes: tuple[Shape, ...], fps: float, measured: Measured, image: tuple[int, int], frames: int) -> ClipFit:
-    return ClipFit(MujocoSimulator(shapes, fps, 1), measured, image, frames)
+def _made(shapes: tuple[Shape, ...], fps: float, measured: Measured, image, frames: int, threads: int) -> ClipFit:
+    return ClipFit(MujocoSimulator(shapes, fps, threads), measured, image, frames)

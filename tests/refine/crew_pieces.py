@@ -39,7 +39,7 @@ class Again:
 
     facts: str
 
-    def __call__(self) -> Plain:
+    def __call__(self, threads: int) -> Plain:
         return Plain(self.facts)
 
 
