@@ -197,35 +197,74 @@ def quaternion(matrix: Float[np.ndarray, "3 3"]) -> list[float]:
     return np.roll(q / np.linalg.norm(q), -1).tolist()
 
 
-def simulate(entries: list[Entry], effects: tuple[Effect, ...], seconds: float) -> Track:
-    """Runs a scene with effects from its start, `seconds` long, RATE steps a second."""
-    steps = int(np.ceil(seconds * RATE)) + 2
+@contextlib.contextmanager
+def engine() -> Iterator[Engine]:
+    """`simulate` for many runs, each from a fresh start; what is printed meanwhile goes nowhere."""
     with _client() as client:
-        stage = _Stage(client, entries, effects)
+        yield Engine(client)
+
+
+class Engine:
+    """A client that is emptied before every run."""
+
+    def __init__(self, client: int):
+        self.client = client
+
+    def run(self, entries: list[Entry], effects: tuple[Effect, ...], seconds: float) -> Track:
+        """As `simulate`."""
+        stage, steps = self._staged(entries, effects, seconds)
         count, gap = len(stage.ids), stage.gap()
         position, turn = np.zeros((steps, count, 3)), np.zeros((steps, count, 4))
         scale, speed = np.ones((steps, count)), np.zeros((steps, count))
         acting = np.zeros((len(effects), steps, count), bool)
         for step in range(steps):
-            time = step / RATE
-            for i, body in enumerate(stage.ids):
-                state = stage.state(i)
-                state = forces.jump(effects, i, time, state, body, client)
-                position[step, i] = state.position
-                turn[step, i], speed[step, i] = state.quaternion, np.linalg.norm(state.velocity)
-                scale[step, i] = forces.size(effects, i, time)
-                patch = stage.friction(i, state)
-                for k, effect in enumerate(effects):
-                    force = forces.force(effect, i, stage.objects[i], time, state, stage.gravity)
-                    acting[k, step, i] = patch if effect.name == "friction_patch" else force is not None
-                    if force is not None:
-                        where = state.position.tolist()
-                        pybullet.applyExternalForce(
-                            body, -1, force.tolist(), where, pybullet.WORLD_FRAME, physicsClientId=client
-                        )
-            pybullet.stepSimulation(physicsClientId=client)
+            for i in range(count):
+                state = _act(stage, i, step, scale, acting)
+                position[step, i], turn[step, i] = state.position, state.quaternion
+                speed[step, i] = np.linalg.norm(state.velocity)
+            pybullet.stepSimulation(physicsClientId=self.client)
             stage.contacts(acting[:, step])
         for i, centre in enumerate(stage.centre):
             if centre.any():  # from the centre of mass to the geometric one
                 position[:, i] -= rotation.matrix(turn[:, i]) @ centre
         return Track(position, continuous(turn), scale, speed, stage.touched, gap, acting, stage.hit)
+
+    def poses(self, entries: list[Entry], seconds: float) -> Track:
+        """The same motion without effects, quicker: speeds and contacts are left out (zeros, and no gap)."""
+        stage, steps = self._staged(entries, (), seconds)
+        count, client, step = len(stage.ids), self.client, pybullet.stepSimulation
+        found = []
+        for _ in range(steps):
+            found += [pybullet.getBasePositionAndOrientation(body, physicsClientId=client) for body in stage.ids]
+            step(physicsClientId=client)
+        position = np.array([place for place, _ in found]).reshape(steps, count, 3)
+        turn = np.roll(np.array([turn for _, turn in found]).reshape(steps, count, 4), 1, -1)
+        none = np.zeros((steps, count))
+        return Track(
+            position, continuous(turn), none + 1, none, stage.touched, 0.0, np.zeros((0, steps, count), bool), None
+        )
+
+    def _staged(self, entries: list[Entry], effects: tuple[Effect, ...], seconds: float) -> tuple[_Stage, int]:
+        pybullet.resetSimulation(physicsClientId=self.client)
+        return _Stage(self.client, entries, effects), int(np.ceil(seconds * RATE)) + 2
+
+
+def simulate(entries: list[Entry], effects: tuple[Effect, ...], seconds: float) -> Track:
+    """Runs a scene with effects from its start, `seconds` long, RATE steps a second."""
+    with engine() as opened:
+        return opened.run(entries, effects, seconds)
+
+
+def _act(stage: _Stage, i: int, step: int, scale: np.ndarray, acting: np.ndarray) -> forces.State:
+    """Lets the effects act on object i in a step, and notes its size and who acted; its state."""
+    effects, client, body, time = stage.effects, stage.client, stage.ids[i], step / RATE
+    state = forces.jump(effects, i, time, stage.state(i), body, client)
+    scale[step, i] = forces.size(effects, i, time)
+    patch = stage.friction(i, state)
+    for k, effect in enumerate(effects):
+        force = forces.force(effect, i, stage.objects[i], time, state, stage.gravity)
+        acting[k, step, i] = patch if effect.name == "friction_patch" else force is not None
+        if force is not None:
+            where = state.position.tolist()
+            pybullet.applyExternalForce(body, -1, force.tolist(), where, pybullet.WORLD_FRAME, physicsClientId=client)
+    return state
