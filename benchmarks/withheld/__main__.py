@@ -1,4 +1,4 @@
-"""`python -m benchmarks.withheld make | answer | score`: the diagnosis' withheld exam."""
+"""`python -m benchmarks.withheld make | answer | left | score`: the diagnosis' withheld exam."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import cv2
 
 from benchmarks.withheld import answer as answers_
 from benchmarks.withheld import exam, plan
+from benchmarks.withheld import left as lefts
 from benchmarks.withheld import score as scores
 from benchmarks.withheld import sheet as sheets
 from mjx_refine.files import write_text
@@ -71,6 +72,23 @@ def answer(folder: Path, out: Path, alone: bool, jobs: int) -> None:
         click.echo(f"{result['clip']}: exit {result['status']}, {result['seconds']} s, {result['peak_mb']} MB")
     if failed:
         raise click.ClickException(f"{failed} diagnoses failed; see log.txt in their folders, and call again")
+
+
+@main.command()
+@click.argument("folder", metavar="EXAM", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--jobs", type=click.IntRange(1), default=1, show_default=True)
+def left(folder: Path, jobs: int) -> None:
+    """Measures what a refit of the scene leaves of every effect's size, into left.json; goes on where it stopped."""
+    faults = 0
+    try:
+        for one in lefts.measure(folder, jobs):
+            faults += "fault" in one
+            each = [f"{e['effect']} {e['px']:.1f} px, {e['px_left']:.1f} left" for e in one.get("effects", ())]
+            click.echo(f"{one['clip']}: {one.get('fault') or ', '.join(each)} ({one.get('seconds', 0):.0f} s)")
+    except ValueError as error:
+        raise click.ClickException(str(error)) from error
+    if faults:
+        raise click.ClickException(f"{faults} clips cannot be made again here; measure them where the exam was made")
 
 
 @main.command()

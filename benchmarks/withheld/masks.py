@@ -91,6 +91,23 @@ def bitten(film: Film, effect: Effect) -> float:
     return most
 
 
+def bites(film: Film, effect: Effect) -> Float[np.ndarray, "frames objects 16"]:
+    """By how much an occluder shortens each object's reaches, pixels (a whole object that is hidden loses nothing)."""
+    values = effect.parameters
+    part = (
+        slice(round(values["top"] / 2), round(values["bottom"] / 2)),
+        slice(round(values["left"] / 2), round(values["right"] / 2)),
+    )
+    out = np.zeros((film.frames, len(film.solids), len(OUTLINE)))
+    for frame, objects in enumerate(shown(film)):
+        for i, seen in enumerate(objects):
+            left = seen.copy()
+            left[part] = False
+            if left.any() and left.sum() < seen.sum():
+                out[frame, i] = 2 * (_supports(seen) - _supports(left))
+    return out
+
+
 def hidden_frames(film: Film, effect: Effect) -> list[int]:
     """Frames in which an occluder hides part of an object."""
     values = effect.parameters

@@ -1,0 +1,188 @@
+"""What is left of an effect once the scene has been refitted: the model against the film, widths against draws, files."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pybullet", reason="the exam needs the bench extra")
+
+from click.testing import CliRunner
+
+from benchmarks.withheld import __main__ as commands
+from benchmarks.withheld import left, masks, physics, refit, solve, start
+from benchmarks.withheld.base import Base
+from benchmarks.withheld.effect import Effect
+from benchmarks.withheld.stage import Stage
+
+
+def body(kind, name, position, velocity, spin, **size):
+    return {
+        "type": kind,
+        "name": name,
+        **size,
+        "state": {
+            "position": list(position),
+            "orientation": [1.0, 0, 0, 0],
+            "linear_velocity": list(velocity),
+            "angular_velocity": list(spin),
+        },
+        "physics": {"friction": [0.5, 0.002], "mass": 1.5, "damping": -60.0},
+    }
+
+
+def scene(*objects):
+    return [
+        *objects,
+        {"type": "camera", "fovy": 45.0, "orientation": 45.0, "position": [0.0, -2.0, 3.5]},
+        {"type": "gravity", "gravity": [0.0, 0.0, -9.81]},
+    ]
+
+
+BALL = body("sphere", "sphere_0", (-0.8, 0.5, 0.6), (1.5, 0.6, 2.5), (3.0, 2.0, 6.0), radius=0.25)
+BOX = body("box", "box_1", (0.9, 1.8, 0.2), (0.0, 0, 0), (0.0, 0, 0), size=[0.3, 0.25, 0.2])
+SHAKE = Effect("camera_shake", None, {"yaw": [0.3, -0.3] * 15, "pitch": [0.1, 0.0, -0.1] * 10, "amplitude": 0.2})
+DRAG = Effect("drag", 0, {"linear": 0.1, "quadratic": 0.1})
+
+
+def stage():
+    return Stage(scene(BALL, BOX), "flight")
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        (),
+        (SHAKE, Effect("lens_distortion", None, {"k1": 0.1})),
+        (Effect("dropped_frames", None, {"frame": 9, "count": 3}),),
+        (Effect("shape", 0, {}, {"form": "ellipsoid", "strength": 0.5, "lean": [1.0, -0.8, 0.2]}),),
+        (Effect("shrinking", 0, {"rate": 0.5}),),
+        (Effect("rolling_shutter", None, {"readout": 0.02}),),
+    ],
+)
+def test_reaches_are_the_outlines(effects):
+    film = stage().film(effects)
+    np.testing.assert_allclose(refit.reaches(film), film.outlines, atol=1e-9)
+
+
+def test_flow_is_that_of_the_points():
+    film, radius = stage().film((SHAKE,)), np.array([0.25, 0.3])
+    flow = refit.flows(film, radius)
+    place, turn, _ = film.track.at(film.view.times, 0)
+    arm = turn[4].T @ (film.view.turn[4] @ (0.8 * 0.25 * refit.NEAR[1]))
+    there = film.view.show(film.track, 0, arm[None], 5) - film.view.show(film.track, 0, arm[None], 4)
+    np.testing.assert_allclose(flow[4, 0, 1], there[0], atol=1e-9)
+    assert (film.view.turn[4].T @ (place[4] + turn[4] @ arm - film.view.origin[4]))[2] < -0.5  # before the camera
+
+
+def test_quick_poses_are_the_motion():
+    entries = stage().entries
+    with physics.engine() as opened:
+        opened.run(scene(BALL), (DRAG,), 0.3)
+        track, slow = opened.poses(entries, 0.8), physics.simulate(entries, (), 0.8)
+    np.testing.assert_array_equal(track.position, slow.position)
+    np.testing.assert_array_equal(track.quaternion, slow.quaternion)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [(DRAG,), (DRAG, SHAKE), (Effect("mask_bias", None, {"width": -4.0}),), (Effect("slope", None, {"x": 2, "y": 1}),)],
+)
+def test_nothing_is_left_of_what_is_known(effects):
+    with physics.engine() as opened:
+        known = refit.Refit(opened, stage(), effects, effects)
+        zero = np.zeros(len(known.base.numbers))
+        assert known.ended(zero).cost == pytest.approx(0, abs=1e-12)
+        assert refit.Refit(opened, stage(), effects).ended(zero).reach > 1
+
+
+def test_the_base_moves_as_rough_scenes_do():
+    entries = scene(BALL, BOX)
+    base, rng = Base(entries), np.random.default_rng(0)
+    assert base.at(np.zeros(len(base.numbers))) == entries
+
+    def numbers(drawn):
+        camera = next(e for e in drawn if e["type"] == "camera")
+        pull = next(e for e in drawn if e["type"] == "gravity")
+        out = [camera["orientation"], camera["fovy"], camera["position"][2], pull["gravity"][2]]
+        for entry in drawn[:2]:
+            state = entry["state"]
+            out += [*state["position"], *state["linear_velocity"], *state["angular_velocity"]]
+            out += [*np.log(entry["physics"]["friction"]), np.log(-entry["physics"]["damping"])]
+        return np.array([*out, drawn[0]["radius"], *drawn[1]["size"]])
+
+    drawn = np.std([numbers(start.rough(entries, rng)) for _ in range(600)], 0)
+    moved = np.sqrt(
+        np.mean([(numbers(base.at(s)) - numbers(entries)) ** 2 for s in rng.normal(size=(600, len(base.numbers)))], 0)
+    )
+    told = drawn > 0
+    np.testing.assert_allclose(moved[told], drawn[told], rtol=0.15)
+    names = {number.name for number in base.numbers}
+    assert {"box_1.velocity.x", "box_1.spin.up", "sphere_0.position.z"} <= names
+    assert not {"box_1.position.z", "box_1.turn.x", "sphere_0.mass"} & names
+    assert "box_1.mass" in {number.name for number in Base(entries, (0, 1)).numbers}
+
+
+def test_less_gravity_takes_up_part_of_a_drag(monkeypatch):
+    for name in ("ANNEALED", "GROWING", "HOPS"):
+        monkeypatch.setattr(refit, name, ())
+    with physics.engine() as opened:
+        alone = Stage(scene(BALL), "flight")
+        px = solve.displacement(alone, DRAG, "objects")
+        found = left.left(opened, alone, (DRAG,), (), np.random.default_rng(0))
+        whole = left.left(opened, alone, (DRAG, SHAKE), (DRAG,), np.random.default_rng(0))
+    assert 0 < found["px_left"] == found["reach"] < 0.5 * px
+    assert found["background"] == 0
+    assert found["shifts"]
+    assert found["cost"] == pytest.approx(min(found["costs"]), abs=0.1)
+    assert whole["px_left"] == pytest.approx(solve.displacement(alone, SHAKE, "picture"), abs=1e-3)
+
+
+def test_what_an_occluder_hides_is_not_explained():
+    film = stage().base
+    reach = film.outlines[10, 0]
+    low, high = float(-reach[12]), float(reach[4])
+    right = float(round(reach[0]))
+    effect = Effect("occluder", None, {"left": right - 8, "top": low - 5, "right": right + 30, "bottom": high + 5})
+    bites = masks.bites(film, effect)
+    assert bites.max() == masks.bitten(film, effect)
+    assert bites[:, 1].max() == 0
+    with physics.engine() as opened:
+        fit = refit.Refit(opened, stage(), (effect,))
+        np.testing.assert_allclose(fit.ended(np.zeros(len(fit.base.numbers))).reach, bites.max())
+
+
+def test_an_exam_is_measured_once(tmp_path):
+    alone = Stage(scene(BALL), "flight")
+    px = solve.displacement(alone, SHAKE, "picture")
+    told = {"effect": SHAKE.name, "target": None, "parameters": SHAKE.parameters, "hidden": {}, "px": round(px, 3)}
+    key = {
+        "split": "one",
+        "effects": [told],
+        "kind": "flight",
+        "objects": ["sphere_0"],
+        "seed": [1, 2],
+        "truth": alone.entries,
+    }
+    folder = tmp_path / "key"
+    folder.mkdir()
+    (folder / "000.json").write_text(json.dumps({**key, "effects": []}))
+    (folder / "001.json").write_text(json.dumps(key))
+    (folder / "002.json").write_text(json.dumps({**key, "effects": [{**told, "px": 2 * px}]}))
+    done = CliRunner().invoke(commands.main, ["left", str(tmp_path)])
+    assert done.exit_code == 1
+    assert f"002: camera_shake moves the picture by {px:.3f} px here" in done.output
+    assert "1 clips cannot be made again here" in done.output
+    found = left.read(tmp_path)
+    assert list(found) == ["001"]
+    assert found["001"]["effects"][0]["px_left"] == pytest.approx(px, abs=1e-3)
+    (folder / "002.json").unlink()
+    again = CliRunner().invoke(commands.main, ["left", str(tmp_path)])
+    assert (again.exit_code, again.output) == (0, "")
+    (folder / "001.json").unlink()
+    (folder / "000.json").unlink()
+    none = CliRunner().invoke(commands.main, ["left", str(tmp_path)])
+    assert none.exit_code == 1
+    assert "holds no clip's key" in none.output
