@@ -47,7 +47,9 @@ class Mark:
         verdict declares it indistinguishable from its own first. object_right, frames_right, since_right: of the place,
         None where no place is asked for; `since` counts all frames from the first on.
       closed: of the gap, None where the file has none. errors: of the parameters by "effect: parameter".
-      px: largest displacement. flow, kind: of the clip. seconds, peak_mb: of the diagnosis.
+      px: largest displacement. lefts: what is left of each effect's once the scene has been refitted (`left.py`), px; empty where
+        it has not been measured. rank: place of the right name among the candidates, from 1, None where it is not there or
+        there is not one right name. flow, kind: of the clip. seconds, peak_mb: of the diagnosis.
     """
 
     clip: str
@@ -68,10 +70,19 @@ class Mark:
     seconds: float
     peak_mb: float
     errors: dict[str, float] = field(default_factory=dict)
+    lefts: tuple[float, ...] = ()
+    rank: int | None = None
+
+    @property
+    def px_left(self) -> float | None:
+        """What is left of the least of its effects, px; None where it has not been measured."""
+        return min(self.lefts) if self.lefts else None
 
 
-def mark(clip: str, key: dict[str, Any], diagnosis: dict[str, Any], ran: dict[str, Any]) -> Mark:
-    """Compares an answer with its key.
+def mark(
+    clip: str, key: dict[str, Any], diagnosis: dict[str, Any], ran: dict[str, Any], left: dict[str, Any] | None = None
+) -> Mark:
+    """Compares an answer with its key; `left`: what has been measured by `left.py`, if it has.
 
     Raises:
       KeyError: the diagnosis lacks something that its format demands.
@@ -107,6 +118,8 @@ def mark(clip: str, key: dict[str, Any], diagnosis: dict[str, Any], ran: dict[st
         seconds=float(ran["seconds"]),
         peak_mb=float(ran["peak_mb"]),
         errors=_errors(key, diagnosis, said) if split in ("one", "two") else {},
+        lefts=tuple(float(effect["px_left"]) for effect in left["effects"]) if left else (),
+        rank=candidates.index(truth[0]) + 1 if split == "one" and truth[0] in candidates else None,
     )
 
 

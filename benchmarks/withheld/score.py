@@ -9,10 +9,13 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from benchmarks.withheld import left
 from benchmarks.withheld.answer import answered
 from benchmarks.withheld.marks import APART, LOCATED, Mark, mark
 from benchmarks.withheld.plan import SPLITS
 
+LEFT = ((0, 1), (1, 3), (3, 6), (6, 12), (12, 40))
+LEAST_LEFT = 3.0  # px: of an effect of which less is left, a clip hardly tells
 SIZES = ((3, 6), (6, 12), (12, 24), (24, 40))
 BINS = 10
 
@@ -27,14 +30,14 @@ def marks(exam: Path, answers: Path) -> list[Mark]:
     missing = [path.stem for path in keys if not answered(answers / path.stem)]
     if missing or not keys:
         raise ValueError(f"{len(missing)} of {len(keys)} clips have no answer yet: {', '.join(missing)}")
-    out = []
+    out, lefts = [], left.read(exam)
     for path in keys:
         folder = answers / path.stem
         key, diagnosis, ran = (
             json.loads(file.read_text()) for file in (path, folder / "diagnosis.json", folder / "answer.json")
         )
         try:
-            out.append(mark(path.stem, key, diagnosis, ran))
+            out.append(mark(path.stem, key, diagnosis, ran, lefts.get(path.stem)))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{folder / 'diagnosis.json'}: {type(error).__name__} {error}") from error
     return out
@@ -55,7 +58,10 @@ def calibration_error(probabilities: list[float], right: list[bool], bins: int =
 def report(found: list[Mark]) -> str:
     """All tables."""
     parts = [_summary(found), _calibration(found), _places(found), _effects(found), _sizes(found), _flows(found)]
-    return "\n\n".join([*parts, _parameters(found), _confusion(found), _list(found)]) + "\n"
+    if any(m.lefts for m in found):
+        parts += [_left(found), _left_sizes(found)]
+    parts += [_parameters(found), _confusion(found), _missed(found), _list(found)]
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _share(values: Iterable[bool]) -> str:
@@ -151,6 +157,48 @@ def _sizes(found: list[Mark]) -> str:
 def _within(px: float, low: int, high: int) -> bool:
     """Sizes are aimed at 3 to 40 and miss by a little: the outermost classes are open."""
     return (px >= low or low == SIZES[0][0]) and (px < high or high == SIZES[-1][1])
+
+
+def _left(found: list[Mark]) -> str:
+    held = [m for m in found if m.px_left is not None and m.px_left >= LEAST_LEFT]
+    one, two = _of(held, "one"), _of(held, "two")
+    rows = [
+        [f"one effect, of those with >= {LEAST_LEFT:g} px left: first", _share(m.first for m in one)],
+        [f"one effect, of those with >= {LEAST_LEFT:g} px left: first two", _share(m.near for m in one)],
+        [f"two effects, both with >= {LEAST_LEFT:g} px left: both names, no other", _share(m.right for m in two)],
+        [f"two effects, both with >= {LEAST_LEFT:g} px left: one of them first", _share(m.first for m in two)],
+        [f"withheld effect with >= {LEAST_LEFT:g} px left: unknown", _share(m.right for m in _of(held, "withheld"))],
+        [
+            f"strange effect with >= {LEAST_LEFT:g} px left: unknown, or a name that the key accepts",
+            _share(m.right for m in _of(held, "strange")),
+        ],
+    ]
+    with_effects = [m for m in found if m.truth]
+    told = sum(bool(m.lefts) for m in with_effects)
+    return _table(
+        [f"what the base model's refit leaves ({told} of {len(with_effects)} clips measured)", "result"], rows
+    )
+
+
+def _left_sizes(found: list[Mark]) -> str:
+    rows = []
+    for low, high in LEFT:
+        top = float("inf") if high == LEFT[-1][1] else high
+        held = [m for m in _of(found, "one") if m.px_left is not None and low <= m.px_left < top]
+        title = f"{low}-{high}{'+' if top > high else ''} px"
+        rows.append([title, _share(m.first for m in held), _share(m.near for m in held)])
+    return _table(["size left by a refit", "first", "first two"], rows)
+
+
+def _missed(found: list[Mark]) -> str:
+    """One-effect clips whose effect is not named first, the most that is left first; nothing where there is none."""
+    missed = [m for m in _of(found, "one") if not m.first]
+    rows = []
+    for m in sorted(missed, key=lambda m: (-(m.px_left or 0), -(m.px or 0))):
+        sizes = ["" if v is None else f"{v:.1f}" for v in (m.px, m.px_left)]
+        rows.append([m.clip, m.truth[0], *sizes, _said(m), str(m.rank or "-")])
+    head = ["missed clip", "effect", "px", "px left", "answer", "rank of the right name"]
+    return _table(head, rows) if rows else ""
 
 
 def _flows(found: list[Mark]) -> str:

@@ -184,6 +184,25 @@ def test_report_by_hand(tmp_path):
         "| push | 1 |  |  |",
     ):
         assert line in text
+    assert "| 001 | push | 30.0 |  | drag | - |" in text  # missed
+    assert "left by a refit" not in text
+    lefts = {"000": [2.0], "001": [7.5], "002": [4.0, 3.5], "004": [1.0]}
+    measured = {clip: {"effects": [{"px_left": px} for px in each]} for clip, each in lefts.items()}
+    (tmp_path / "exam/left.json").write_text(json.dumps({"clips": measured}))
+    more = score.report(score.marks(tmp_path / "exam", tmp_path / "out"))
+    for line in (
+        "| what the base model's refit leaves (4 of 4 clips measured) | result |",
+        "| one effect, of those with >= 3 px left: first | 0/1 (0 %) |",
+        "| one effect, of those with >= 3 px left: first two | 0/1 (0 %) |",
+        "| two effects, both with >= 3 px left: both names, no other | 1/1 (100 %) |",
+        "| withheld effect with >= 3 px left: unknown | - |",
+        "| 1-3 px | 1/1 (100 %) | 1/1 (100 %) |",
+        "| 6-12 px | 0/1 (0 %) | 0/1 (0 %) |",
+        "| 12-40+ px | - | - |",
+        "| 001 | push | 30.0 | 7.5 | drag | - |",
+    ):
+        assert line in more
+    assert set(text.splitlines()) - set(more.splitlines()) == {"| 001 | push | 30.0 |  | drag | - |"}
     (tmp_path / "out/003/diagnosis.json").write_text('{"format": 1}')
     with pytest.raises(ValueError, match=r"003/diagnosis\.json: KeyError 'verdict'"):
         score.marks(tmp_path / "exam", tmp_path / "out")
