@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -112,7 +113,7 @@ def _spins(entry: Entry, rests: bool) -> list[tuple[str, np.ndarray]]:
     return [("up", turn.T @ UP * UNTURNED)]
 
 
-def _scaled(path: tuple[str | int, ...], width: float) -> Move:
+def _scaled(path: tuple[Any, ...], width: float) -> Move:
     def move(entry: Entry, x: float) -> None:
         *way, last = path
         for key in way:

@@ -82,7 +82,8 @@ def left(
     """What is left of the effects that are not known, once the scene with the known ones has been refitted.
 
     Returns:
-      `px_left`; `reach` and `flow`: what is left of outlines and of flow, px; `background`: px; `cost`: sum of squares in noise
+      `px_left`; `reach` and `flow`: what is left of outlines and of flow, px (not searched for long where the background's
+      motion is more anyway); `background`: px; `cost`: sum of squares in noise
       widths; `costs`: of all fits; `shifts`: of the scene's numbers that moved notably, in widths of their priors.
     """
     model = refit.Refit(opened, stage, effects, known)
@@ -104,7 +105,10 @@ def left(
 
 
 def left_of(path: Path) -> dict[str, Any]:
-    """What is left of a clip's effects, together and each by itself, the others being known; or why it cannot be told."""
+    """What is left of a clip's effects, together and each by itself, the others being known; or why it cannot be told.
+
+    Of several clips of a set-up, the key and so the result tell of the first.
+    """
     begun, key = time.perf_counter(), json.loads(path.read_text())
     try:
         stage, effects = clip_of(key)

@@ -204,7 +204,7 @@ class Refit:
         def slope(x: np.ndarray) -> np.ndarray:
             return np.concatenate([self.slopes(x, leg).reshape(-1, len(x)), np.eye(len(x))])
 
-        return least_squares(value, start, slope, max_nfev=EVALUATIONS, ftol=1e-3, xtol=1e-4, gtol=1e-6).x
+        return least_squares(value, start, slope, max_nfev=EVALUATIONS, ftol=1e-3, xtol=1e-4, gtol=1e-6).x  # type: ignore[arg-type]
 
     def ended(self, shifts: Float[np.ndarray, "numbers"]) -> Fit:
         """A point with what is left there."""
