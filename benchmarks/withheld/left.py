@@ -17,7 +17,8 @@ Displacements are those of the objects' outlines, reach by reach in 16 direction
 - `camera_roll` and `lens_distortion`: a still background says nothing without a picture of it to compare with, so only the
   objects tell of them. `px`, counted on the floor, may be far more.
 
-A refit lies in the middle: of a jump by 8 px it leaves about 4 on either side, of a bend its sagitta.
+A refit lies in the middle: of a jump by 8 px it leaves about 4 on either side, of a bend its sagitta. It minimises squares,
+not the largest distance, so that one reach may end farther off than `px`.
 
 The fit also sees the flow on each object, so that its spin is not free to take; what is left of the flow is told beside.
 """
