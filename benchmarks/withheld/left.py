@@ -20,6 +20,8 @@ Displacements are those of the objects' outlines, reach by reach in 16 direction
 A refit lies in the middle: of a jump by 8 px it leaves about 4 on either side, of a bend its sagitta. It minimises squares,
 not the largest distance, so that one reach may end farther off than `px`.
 
+It is an upper bound: after bounces more starts find lower ends still, and `costs` tells how far the fits agree.
+
 The fit also sees the flow on each object, so that its spin is not free to take; what is left of the flow is told beside.
 """
 

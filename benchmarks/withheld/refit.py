@@ -226,6 +226,7 @@ COARSE, FINE = 0.05, 0.001  # steps, in widths: contacts make the misfit jagged,
 DIRECT = (Leg(step=COARSE),)
 ANNEALED = (Leg(blur=10.0, step=COARSE), Leg(blur=3.0, step=COARSE), Leg())
 GROWING = (Leg(10, 3.0), Leg(20, 3.0), Leg())
+DRAWS = 4  # starts from the prior
 HOPS = (0.5, 0.15)  # starts beside the best end so far, so many widths off
 NOTHING = 0.5  # px: with less left, no further start is tried
 
@@ -233,7 +234,7 @@ NOTHING = 0.5  # px: with less left, no further start is tried
 def best(refit: Refit, rng: np.random.Generator, enough: float = 0.0) -> tuple[Fit, list[float]]:
     """The lowest of several fits, and all their costs in order.
 
-    The starts: the truth at once; the truth with raised noise; the truth with more and more frames; a draw of the prior
+    The starts: the truth at once; the truth with raised noise; the truth with more and more frames; draws of the prior
     with raised noise; points beside the best end so far. Between them the best end is refined by other steps.
 
     Args:
@@ -252,7 +253,9 @@ def best(refit: Refit, rng: np.random.Generator, enough: float = 0.0) -> tuple[F
         return along(least(ends).shifts + rng.normal(0, hop, len(zero)), (Leg(step=step),))
 
     done = along(zero, DIRECT) or from_best(0, FINE) or along(zero, ANNEALED) or along(zero, GROWING)
-    done = done or along(rng.normal(size=len(zero)), ANNEALED) or from_best(0, FINE)
+    for _ in range(DRAWS):
+        done = done or along(rng.normal(size=len(zero)), ANNEALED)
+    done = done or from_best(0, FINE)
     for hop in HOPS:
         done = done or from_best(hop, Leg().step)
     if not done:
