@@ -27,8 +27,8 @@ from mjx_refine.diagnosis.store import Arrays, Borrowed, Store
 
 log = logging.getLogger("mjx_refine")
 
-MOST = 16
-"""Processes: hardly ever are there more pieces at a time, and each takes some hundred megabytes."""
+MOST = 12
+"""Processes: hardly ever are there more pieces at a time, and each takes half a gigabyte."""
 
 
 Piece = Callable[..., Any]
