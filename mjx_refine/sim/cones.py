@@ -1,7 +1,8 @@
 """The kernel that adds the curvature of friction cones to the solver's Hessian, for free bodies only.
 
 MJX-Warp's own looks at every pair of degrees of freedom of the scene for every contact. A contact touches two bodies, which
-have twelve: of four objects that is 78 pairs instead of 300, and the kernel took a quarter of a step.
+have twelve: of four objects that is 78 pairs instead of 300. There the kernel took 0.89 of 3.0 ms of a step with 3,072 candidates on
+an H100, and takes 0.36 with 2,688; with two objects, which have 78 pairs anyway, it takes what it took.
 """
 
 # pyright: reportInvalidTypeForm=false
@@ -137,7 +138,7 @@ def cone_curvature(
     width = tri_row.shape[0]
     bodies = (tri_row[width - 1] + 1) // 6
     for item in range(block * width + element, wp.min(count[0], most) * _PAIRS, blocks * width):
-        # What depends on nothing is read first, side by side: a thread waits for memory, not for arithmetic.
+        # What depends on nothing is read first.
         contact = item // _PAIRS
         world = world_of[contact]
         rows = dimension[contact]
