@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 
 import numpy as np
 import pytest
@@ -12,8 +11,6 @@ from benchmarks.speed_scenes import KINDS, near
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.sim.warp import FINE, KEPT, SPARE, WarpSimulator
 from mjx_refine.space import Space
-
-pytestmark = pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="Warp is not installed")
 
 
 def candidates(kind: str, count: int):
