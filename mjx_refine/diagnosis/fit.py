@@ -19,7 +19,7 @@ from mjx_refine.diagnosis.pace import DAMPINGS, STEPS, Pace, damped, updated
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.roam import GENERATIONS, ROAMED, Strategy
 from mjx_refine.diagnosis.settled import Loose, Settled
-from mjx_refine.diagnosis.slack import Slack, impacts, kicked, slack_of, sustained, too_wide, touching
+from mjx_refine.diagnosis.slack import PART, Impact, Slack, Slacks, impacts, kicked, sustained, too_wide, touching
 from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
 from mjx_refine.scene import Shape
 from mjx_refine.search.landing import slowed
@@ -60,7 +60,7 @@ class ClipFit:
         self.slackness = 1.0
         self._loose: Loose | None = None
         self._columns: np.ndarray | None = None
-        self._slacks: dict[bytes | None, Slack] = {}
+        self._slacks = Slacks()
 
     # --- in other processes -----------------------------------------------------------------------------------------
     def again(self) -> Callable[[int], ClipFit]:
@@ -76,7 +76,7 @@ class ClipFit:
     @settled.setter
     def settled(self, told: Settled) -> None:
         self.measured, self.noise, self.counts, self._columns = told.measured, told.noise, told.counts, told.columns
-        self._loose, self._slacks = None, {}
+        self._loose, self._slacks = None, Slacks()
 
     def warm(self) -> None:
         """Compiles what predictions need."""
@@ -116,39 +116,37 @@ class ClipFit:
         """Lets contacts of a base model's fit err, and masks be a little wide; returns how many impacts there are."""
         batch = fit.hypothesis.batch(fit.z[None])
         poses = self.poses(fit.hypothesis, fit.z[None])[0]
-        self._loose, self._columns, self._slacks = None, None, {}
+        self._loose, self._columns, self._slacks = None, None, Slacks()
         if not np.isfinite(poses).all():
             return 0
-        still = self.predictor(poses[None], batch)
         found = impacts(batch, poses, self.simulator.fps)
         sharp = self.noise
         long = sustained(batch, poses, touching(batch, poses), self.simulator.fps)
-        kicks = None
-        if found or long:
-            rows = kicked(self.simulator, batch, poses, [*found, *long])
-            self.rollouts += len(rows)
-            many = batch.map(lambda a: np.repeat(a[:1], len(rows), 0))
-            moved = self.predictor(rows, many)
-            kicks = Parts(*(part[~moved.bad] for part in self._change(moved, still)))
+        kicks = self.kicks(batch, poses, [*found, *long], PART) if found or long else None
+        still = self.predictor(poses[None], batch)
         marks = [(i.target, i.frame) for i in found]
         self._loose = Loose(too_wide(self.measured), kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
         self.set_slackness(self.slackness)
         return len(found)
 
+    def kicks(self, batch: SceneBatch, poses: np.ndarray, found: list[Impact], part: float) -> Parts:
+        """What impacts that err by ``part`` of themselves change in the measurements, one standard deviation a row."""
+        rows = kicked(self.simulator, batch, poses, found, part)
+        self.rollouts += len(rows)
+        moved = self.predictor(rows, batch.map(lambda a: np.repeat(a[:1], len(rows), 0)))
+        return Parts(*(change[~moved.bad] for change in self._change(moved, self.predictor(poses[None], batch))))
+
     def set_slackness(self, slackness: float) -> None:
         """How much contacts may err, as a multiple of what they may in one clip alone."""
-        self.slackness, self._slacks = slackness, {}
+        self.slackness, self._slacks = slackness, Slacks()
         if self._loose is None:
             return
         self.noise = self._loose.blurred(slackness)
-        columns = [self.rigid(self._loose.always, None, 1e9)]
-        if self._loose.kicks is not None and slackness > 0:
-            columns.append(self.rigid(self._loose.kicks, None, 1e9 / slackness) * slackness)
-        self._columns = np.concatenate(columns).T
+        self._columns = self._loose.columns(slackness, self.rigid)
 
     def forget_slack(self, noise: Noise) -> None:
         """Contacts may not err any more."""
-        self.noise, self._loose, self._columns, self._slacks = noise, None, None, {}
+        self.noise, self._loose, self._columns, self._slacks = noise, None, None, Slacks()
 
     def _change(self, moved: Prediction, still: Prediction) -> Parts:
         """From one prediction to others [px], zero where nothing was measured."""
@@ -184,14 +182,8 @@ class ClipFit:
             self.noise.background,
         )
 
-    def _slack(self, keep: np.ndarray | None) -> Slack | None:
-        if self._columns is None:
-            return None
-        key = None if keep is None else keep.tobytes()
-        if key not in self._slacks:
-            columns = self._columns if keep is None else self._columns * self.kept(keep)[:, None]
-            self._slacks[key] = slack_of(columns)
-        return self._slacks[key]
+    def _slack(self, keep: np.ndarray | None, excused: np.ndarray | None) -> Slack | None:
+        return None if self._columns is None else self._slacks.of(self._columns, excused, keep, self.kept)
 
     @property
     def slack_columns(self) -> Float[np.ndarray, "residuals columns"]:
@@ -223,9 +215,13 @@ class ClipFit:
         distances: Parts,
         keep: Bool[np.ndarray, "frames"] | None,
         scale: float,
+        excused: np.ndarray | None = None,
     ) -> Float[np.ndarray, "batch residuals"]:
-        """Robust residuals in noise widths; zero where nothing was measured, and in frames that are not kept."""
-        white, slack = self.rigid(distances, keep, scale), self._slack(keep)
+        """Robust residuals in noise widths; zero where nothing was measured, and in frames that are not kept.
+
+        ``excused``: what a hypothesis may err by beside what all may, one standard deviation a column.
+        """
+        white, slack = self.rigid(distances, keep, scale), self._slack(keep, excused)
         return white if slack is None else slack(white)
 
     @property
@@ -274,7 +270,7 @@ class ClipFit:
     def residuals(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE):
         """(residuals (B, R), half their sum of squares with the prior (B,))."""
         prediction = self.predictor(self.poses(hypothesis, z), hypothesis.batch(z))
-        white = self.whitened(self.distances(prediction), keep, scale)
+        white = self.whitened(self.distances(prediction), keep, scale, hypothesis.excused)
         cost = 0.5 * (white**2).sum(1) + 0.5 * (prior(hypothesis, z)[0] ** 2).sum(1)
         return white, np.where(prediction.bad, np.inf, cost)
 
@@ -290,7 +286,7 @@ class ClipFit:
         if moves.any():
             poses[moves] = self.poses(hypothesis, points[moves])
         prediction = self.predictor(poses, hypothesis.batch(points))
-        white = self.whitened(self.distances(prediction), keep, scale)
+        white = self.whitened(self.distances(prediction), keep, scale, hypothesis.excused)
         change = np.where(prediction.bad[:, None], 0.0, white - base)
         return (change / step[:, None]).T
 
@@ -326,7 +322,7 @@ class ClipFit:
                 jacobian, fresh, usual = self.jacobian(hypothesis, z, base, keep, scale, pace.size), True, 0.0
         if pace.size != STEPS[0] or not fresh:
             jacobian = self.jacobian(hypothesis, z, base, keep, scale)
-        return self._finished(hypothesis, z, base, jacobian)
+        return self._finished(hypothesis, z, base, jacobian, keep)
 
     def best_of(self, hypothesis: Hypothesis, points: Float[np.ndarray, "points dimension"], keep=None) -> np.ndarray:
         """The point with the least cost."""
@@ -382,18 +378,20 @@ class ClipFit:
                 fit = trial if trial.cost < fit.cost else fit
         return fit
 
-    def _finished(self, hypothesis: Hypothesis, z, base, jacobian) -> Fit:
+    def _finished(self, hypothesis: Hypothesis, z, base, jacobian, keep=None) -> Fit:
         data = 0.5 * float(base @ base)
         price_of_z, slope = prior(hypothesis, z)
         cost = data + 0.5 * float(price_of_z @ price_of_z)
         logdet = float(np.linalg.slogdet(jacobian.T @ jacobian + np.diag(slope**2))[1])
         price = sum(np.log(t.places) for t in hypothesis.terms)
+        if hypothesis.excused is not None and (slack := self._slack(keep, hypothesis.excused)) is not None:
+            price += slack.price - self._slack(keep, None).price  # type: ignore[union-attr]
         return Fit(hypothesis, z, cost, data, jacobian, base, -cost - 0.5 * logdet - price)
 
     def at(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE) -> Fit:
         """No step, just what holds at ``z``."""
         base, _ = self.residuals(hypothesis, z[None], keep, scale)
-        return self._finished(hypothesis, z, base[0], self.jacobian(hypothesis, z, base[0], keep, scale))
+        return self._finished(hypothesis, z, base[0], self.jacobian(hypothesis, z, base[0], keep, scale), keep)
 
 
 def _made(shapes: tuple[Shape, ...], fps: float, measured: Measured, image, frames: int, threads: int) -> ClipFit:

@@ -35,6 +35,7 @@ class Term:
       high: upper bounds.
       free: which numbers are fitted; the others stay at ``centre``.
       places: how many places or moments were looked through for this one; its logarithm is paid as evidence.
+      excused: what the impact that the effect makes may err by, one standard deviation a column [noise widths]; None: nothing.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Term:
     high: Float[np.ndarray, "parameters"]
     free: Bool[np.ndarray, "parameters"]
     places: int = 1
+    excused: Float[np.ndarray, "residuals columns"] | None = None
 
     @property
     def kind(self) -> EffectKind:
@@ -98,6 +100,12 @@ class Hypothesis:
     def ordinary(self) -> Bool[np.ndarray, "dimension"]:
         """Which coordinates are the base model's."""
         return np.arange(self.dimension) < self.space.dimension
+
+    @functools.cached_property
+    def excused(self) -> Float[np.ndarray, "residuals columns"] | None:
+        """What the terms' impacts may err by, or None."""
+        columns = [t.excused for t in self.terms if t.excused is not None]
+        return (columns[0] if len(columns) == 1 else np.concatenate(columns, 1)) if columns else None
 
     @functools.cached_property
     def tails(self) -> Float[np.ndarray, "dimension"]:

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.hypothesis import Hypothesis, Term
 from mjx_refine.diagnosis.noise import everywhere
 from mjx_refine.scene import Scene
 from mjx_refine.search.problem import Problem
@@ -56,10 +56,11 @@ def _replay(clip: ClipFit, fit: Fit, rigid: np.ndarray, problem: Problem, matchi
     return Replay(scenes[best], float(scores.iou[best]), float(scores.epe[best]))
 
 
+def _fixed(t: Term, values: np.ndarray) -> Term:
+    return dataclasses.replace(t, centre=values, free=np.zeros(len(values), bool), excused=None)
+
+
 def _held(fit: Fit) -> Hypothesis:
     """The fit's hypothesis with its effects held at their values."""
-    terms = tuple(
-        dataclasses.replace(t, centre=fit.hypothesis.values(fit.z[None], k)[0], free=np.zeros(len(t.centre), bool))
-        for k, t in enumerate(fit.hypothesis.terms)
-    )
+    terms = tuple(_fixed(t, fit.hypothesis.values(fit.z[None], k)[0]) for k, t in enumerate(fit.hypothesis.terms))
     return dataclasses.replace(fit.hypothesis, terms=terms)

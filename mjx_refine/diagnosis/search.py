@@ -14,6 +14,7 @@ from mjx_refine.diagnosis.base import base_space, stored_base
 from mjx_refine.diagnosis.exchange import Fitted, Key, exchanged
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.fitted import Explained
+from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen, term_of
 from mjx_refine.diagnosis.slack import spins, touching
@@ -44,6 +45,10 @@ many effects are fitted again with less."""
 SETTLINGS, SETTLED = 8, 0.8
 """How often the noise is then taken anew from what changes from frame to frame, unless that leaves this part of it: one look
 takes off less than half, and a camera that shakes had made twenty times too much of it."""
+
+TURNS, FACINGS = (-60.0, -45.0, -30.0, -15.0, 0.0, 15.0, 30.0, 45.0, 60.0), 2
+"""How far an obstacle's face may be turned from a push's impulse, since it rubs, where fits look [degree]; from how many
+of these they begin, beside the one that is not turned."""
 
 FORGIVING = 40.0
 """Scale of the robust loss while a fit is far off [noise widths]."""
@@ -204,7 +209,7 @@ def _fit_lead(clip: ClipFit, here: Fit, lead: Lead) -> Fit:
     if fit.cost > here.cost and here.z.any():
         # Where the linear look misleads, the effect grows from nothing.
         fit = clip.fit(hypothesis, np.concatenate([here.z, 0 * lead.z(one)]), 9)
-    return fit
+    return knocked(clip, fit)
 
 
 def _begin(clip: ClipFit, hypothesis: Hypothesis, base: Fit, lead: Lead, z: np.ndarray) -> np.ndarray:
@@ -226,7 +231,7 @@ def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: Fitted, view: FitView, 
 
 
 def _wall_from_push(clip: ClipFit, fit: Fit, view: FitView) -> Fit | None:
-    """The fit with an obstacle in the place of its last effect, a push: the wall faces along the impulse."""
+    """The fit with an obstacle in the place of its last effect, a push: the wall faces about along the impulse."""
     *others, push = fit.hypothesis.terms
     rest = dataclasses.replace(fit.hypothesis, terms=tuple(others))
     time, x, y, _ = fit.hypothesis.values(fit.z[None], len(others))[0]
@@ -235,10 +240,17 @@ def _wall_from_push(clip: ClipFit, fit: Fit, view: FitView) -> Fit | None:
     if not np.isfinite(poses).all():
         return None
     there = dataclasses.replace(view, poses=poses)
-    start = HiddenObstacle().facing(there, push.target, frame, float(np.degrees(np.arctan2(y, x))))
-    one = term_of("hidden_obstacle", push.target, dataclasses.replace(start, places=clip.frames), clip.frames)
-    z = np.concatenate([fit.z[: rest.dimension], np.zeros(int(one.free.sum()))])
-    return clip.fit(rest.added(one), z, 9)
+    along = float(np.degrees(np.arctan2(y, x)))
+    moments = sorted({int(np.clip(frame + k, 0, clip.frames - 1)) for k in (-1, 0, 1)})
+    starts = [HiddenObstacle().facing(there, push.target, t, along + turn) for turn in TURNS for t in moments]
+    one = term_of("hidden_obstacle", push.target, dataclasses.replace(starts[0], places=clip.frames), clip.frames)
+    hypothesis = rest.added(one)
+    own = np.array([((start.values - one.centre) / one.width)[one.free] for start in starts])
+    points = np.concatenate([np.repeat(fit.z[None, : rest.dimension], len(own), 0), own], 1)
+    costs = clip.residuals(hypothesis, points)[1].reshape(len(TURNS), -1)
+    facing = {*np.argsort(costs.min(1))[:FACINGS].tolist(), TURNS.index(0.0)}
+    begun = [points[k * len(moments) + int(np.argmin(costs[k]))] for k in sorted(facing)]
+    return max((knocked(clip, clip.fit(hypothesis, z, 9)) for z in begun), key=lambda wall: wall.evidence)
 
 
 def _pairs(
@@ -278,7 +290,7 @@ def _second(clip: ClipFit, first: Fit, lead: Lead) -> Fit:
     """The fit with one more effect."""
     one = lead.term(clip.frames)
     hypothesis = first.hypothesis.added(one)
-    return clip.fit(hypothesis, _begin(clip, hypothesis, first, lead, lead.z(one)), 7)
+    return knocked(clip, clip.fit(hypothesis, _begin(clip, hypothesis, first, lead, lead.z(one)), 7))
 
 
 def _again(
@@ -301,7 +313,8 @@ def _again(
 
 
 def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:
-    return clip.fit(fit.hypothesis, fit.z, iterations)
+    # What an impact may err by is told in noise widths, which are others now.
+    return knocked(clip, clip.fit(fit.hypothesis, fit.z, iterations))
 
 
 def target_name(names: tuple[str, ...], target: int) -> str:

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 
 from jaxtyping import Float
-from numpy import ndarray
+from numpy import concatenate, ndarray
 
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import Counts, Noise
@@ -25,6 +25,15 @@ class Loose:
     always: Parts
     kicks: Parts | None
     blurred: Callable[[float], Noise]
+
+    def columns(
+        self, slackness: float, white: Callable[[Parts, None, float], ndarray]
+    ) -> Float[ndarray, "residuals columns"]:
+        """One standard deviation a column, contacts' times ``slackness``; ``white`` makes noise widths of changes."""
+        always = white(self.always, None, 1e9).T
+        if self.kicks is None or slackness == 0:
+            return always
+        return concatenate([always, white(self.kicks, None, 1e9 / slackness).T * slackness], 1)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -39,6 +40,9 @@ PHASES, SHORTEST = 3, 6
 SLIDING, ROLLING = (0.35, 0.1), (1.0, 0.05)
 """How large the error of the change of velocity in each is against that of an impact, and the least part of the speed that
 is taken for a change: every engine has a law of its own for rolling friction."""
+
+REMEMBERED = 16
+"""Decompositions of columns that are kept at a time."""
 
 BIAS = (0.5, 0.15)
 """Standard deviations of what masks are too wide by, by object: of outlines, whose farthest pixel noise moves outward, and
@@ -77,12 +81,44 @@ class Slack:
     def __call__(self, residuals: Float[np.ndarray, "batch residuals"]) -> Float[np.ndarray, "batch residuals"]:
         return residuals - ((residuals @ self.basis) * self.shrink) @ self.basis.T
 
+    @property
+    def price(self) -> float:
+        """Half the logarithm of det(I + C C')."""
+        return -float(np.log1p(-self.shrink).sum())
+
 
 def slack_of(columns: Float[np.ndarray, "residuals columns"]) -> Slack:
     """From the columns C, one standard deviation each."""
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
     felt = size > FELT
     return Slack(np.ascontiguousarray(basis[:, felt]), 1.0 - 1.0 / np.sqrt(1.0 + size[felt] ** 2))
+
+
+@dataclasses.dataclass
+class Slacks:
+    """What was made of a clip's columns, by frames that are kept and by what a hypothesis adds.
+
+    Attributes:
+      made: by keys; with the columns that were added, so that no other array comes to have their address.
+    """
+
+    made: dict[tuple[bytes, int], tuple[Slack, np.ndarray | None]] = dataclasses.field(default_factory=dict)
+
+    def of(
+        self,
+        columns: Float[np.ndarray, "residuals columns"],
+        added: np.ndarray | None,
+        keep: np.ndarray | None,
+        kept: Callable[[np.ndarray], np.ndarray],
+    ) -> Slack:
+        """From the clip's columns and a hypothesis' own, where ``keep`` (None: everywhere) says by ``kept``."""
+        key = (b"" if keep is None else keep.tobytes(), id(added))
+        if key not in self.made:
+            if len(self.made) >= REMEMBERED:
+                self.made.pop(next(iter(self.made)))
+            both = columns if added is None else np.concatenate([columns, added], 1)
+            self.made[key] = (slack_of(both if keep is None else both * kept(keep)[:, None]), added)
+        return self.made[key][0]
 
 
 def too_wide(measured: Measured) -> Parts:
@@ -154,9 +190,13 @@ def spins(poses: Float[np.ndarray, "frames objects 7"], fps: float) -> Float[np.
 
 
 def kicked(
-    simulator: Simulator, batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], found: list[Impact]
+    simulator: Simulator,
+    batch: SceneBatch,
+    poses: Float[np.ndarray, "frames objects 7"],
+    found: list[Impact],
+    part: float = PART,
 ) -> Float[np.ndarray, "rows frames objects 7"]:
-    """Rollouts that go on from each impact with one standard deviation more of velocity or spin.
+    """Rollouts that go on from each impact with one standard deviation more of velocity or spin, which is ``part`` of its change.
 
     Rows are (impact, three velocities and three spins).
     """
@@ -166,13 +206,13 @@ def kicked(
     rows = np.repeat(poses[None], 6 * len(found), 0)
     for k, impact in enumerate(found):
         size = float(batch.size[0, impact.target].max())
-        width = PART * (impact.change + 0.5 * impact.turn)
+        width = part * (impact.change + 0.5 * impact.turn)
         for axis in range(6):
             dv, dw = np.zeros(3), np.zeros(3)
             if axis < 3:
                 dv[axis] = width
             else:
-                dw[axis - 3] = PART * (impact.turn + 0.3 * impact.change) / size
+                dw[axis - 3] = part * (impact.turn + 0.3 * impact.change) / size
             starts.setdefault(impact.frame, []).append((6 * k + axis, dv, dw))
     for frame, members in starts.items():
         here = _restarted(batch, poses[frame], velocity[frame], spin[frame], len(members))

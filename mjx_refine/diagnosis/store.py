@@ -123,7 +123,7 @@ def _tokens(part: object) -> Iterable[bytes]:
     elif isinstance(part, Hypothesis):
         yield repr(part.space).encode()
         for t in part.terms:
-            yield from _tokens((t.name, t.target, t.centre, t.width, t.low, t.high, t.free, t.places))
+            yield from _tokens((t.name, t.target, t.centre, t.width, t.low, t.high, t.free, t.places, t.excused))
     elif isinstance(told := getattr(part, "parts", None), tuple):
         # Of several clips.
         yield from _tokens((getattr(part, "z", None), told))

@@ -21,7 +21,7 @@ from mjx_refine.diagnosis.pace import STEPS
 from mjx_refine.diagnosis.poses.data import Poses, noise_of, rotation_vector
 from mjx_refine.diagnosis.predict import Prediction
 from mjx_refine.diagnosis.settled import Loose
-from mjx_refine.diagnosis.slack import Impact, impacts, kicked, sustained, touching
+from mjx_refine.diagnosis.slack import PART, Impact, Slacks, impacts, sustained, touching
 from mjx_refine.diagnosis.store import fingerprint
 from mjx_refine.search.landing import slowed
 from mjx_refine.sim.backends import Simulator
@@ -173,17 +173,12 @@ class PosesFit(ClipFit):
         """Lets contacts of a base model's fit err from now on; returns how many impacts there are."""
         batch = fit.hypothesis.batch(fit.z[None])
         poses = self.poses(fit.hypothesis, fit.z[None])[0]
-        self._loose, self._columns, self._slacks = None, None, {}
+        self._loose, self._columns, self._slacks = None, None, Slacks()
         if not np.isfinite(poses).all():
             return 0
         found, long = self._contacts(batch, poses)
-        sharp, kicks = self.noise, None
-        if found or long:
-            still = self.predictor(poses[None], batch)
-            rows = kicked(self.simulator, batch, poses, [*found, *long])
-            self.rollouts += len(rows)
-            moved = self.predictor(rows, batch)
-            kicks = Parts(*(part[~moved.bad] for part in self._change(moved, still)))
+        sharp = self.noise
+        kicks = self.kicks(batch, poses, [*found, *long], PART) if found or long else None
         always = self._unseen_turns(batch, poses)
         self._loose = Loose(always, kicks, lambda factor: self._blurred(sharp, batch, found, factor))
         self.set_slackness(self.slackness)
@@ -235,7 +230,7 @@ class PosesFit(ClipFit):
         step = np.where(z + size > high, -size, size)
         points = np.clip(z + np.diag(step), low, high)
         prediction = self.predictor(self.poses(hypothesis, points), hypothesis.batch(points))
-        white = self.whitened(self.distances(prediction), keep, scale)
+        white = self.whitened(self.distances(prediction), keep, scale, hypothesis.excused)
         return (np.where(prediction.bad[:, None], 0.0, white - base) / step[:, None]).T
 
     def distances(self, prediction: Prediction) -> Parts:

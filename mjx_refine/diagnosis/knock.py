@@ -1,0 +1,65 @@
+"""What an impact with something unseen may err by: nobody knows what it is made of.
+
+An obstacle's face is a plane that pushes through one point and rubs as the floor does. What a body really hits gives
+another impulse, and without this a push through the centre, which may have any direction, explains that better.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.slack import Impact, spins
+
+KNOCKS = ("hidden_obstacle",)
+"""Effects that are impacts."""
+
+PART = 0.25
+"""Standard deviation of such an impulse's error, as a part of the change of velocity."""
+
+ROUNDS, ITERATIONS = 2, 8
+"""How often the impact is looked for again where least squares ended, and of least squares."""
+
+MOVED = 1e-4
+"""Distance from the path without the effect from which on the impact has been [m]."""
+
+
+def knocked(clip: ClipFit, fit: Fit) -> Fit:
+    """The fit once its impacts with unseen things may err; the same where it has none."""
+    for _ in range(ROUNDS):
+        terms = tuple(
+            dataclasses.replace(t, excused=excuses(clip, fit, k)) if t.name in KNOCKS else t
+            for k, t in enumerate(fit.hypothesis.terms)
+        )
+        if all(t.excused is None for t in terms):
+            break
+        trial = clip.fit(dataclasses.replace(fit.hypothesis, terms=terms), fit.z, ITERATIONS)
+        if trial.evidence <= fit.evidence:
+            break
+        fit = trial
+    return fit
+
+
+def excuses(clip: ClipFit, fit: Fit, k: int) -> Float[np.ndarray, "residuals columns"] | None:
+    """What the first impact of term ``k`` may err by, one standard deviation a column; None where there is none."""
+    hypothesis, z, fps = fit.hypothesis, fit.z[None], clip.simulator.fps
+    batch = hypothesis.batch(z)
+    free = dataclasses.replace(batch, effects=batch.effects[:k] + batch.effects[k + 1 :])
+    poses, plain = clip.poses(hypothesis, z)[0], clip.rollout(free, clip.frames)[0]
+    if not (np.isfinite(poses).all() and np.isfinite(plain).all()):
+        return None
+    target = hypothesis.terms[k].target
+    apart = np.linalg.norm(poses[:, target, :3] - plain[:, target, :3], axis=-1)
+    parted = np.nonzero(apart > MOVED)[0]
+    if len(parted) == 0 or parted[0] >= len(poses) - 2:
+        return None
+    # The body may still touch in the first frame that differs.
+    frame = int(parted[0]) + 1
+    change = (poses[frame + 1] - poses[frame] - plain[frame + 1] + plain[frame])[target, :3] * fps
+    turn = (spins(poses, fps)[frame] - spins(plain, fps)[frame])[target]
+    size = float(batch.size[0, target].max())
+    impact = Impact(target, frame, float(np.linalg.norm(change)), float(np.linalg.norm(turn)) * size)
+    return clip.rigid(clip.kicks(batch, poses, [impact], PART), None, 1e9).T
