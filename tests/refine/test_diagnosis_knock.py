@@ -55,7 +55,7 @@ def test_a_wall_that_is_never_met_excuses_nothing():
 
 
 def test_other_hypotheses_are_left_alone():
-    fit_of, hypothesis, z = fitted((WALL,))
+    fit_of, hypothesis, _ = fitted((WALL,))
     drag = dataclasses.replace(hypothesis, terms=(term("drag", 0, FRAMES),))
     fit = fit_of.at(drag, np.zeros(drag.dimension))
     assert knocked(fit_of, fit) is fit
