@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from own_clip import CAMERA, SIZE
 
-from mjx_refine.diagnosis import diagnose
+from mjx_refine.diagnosis import diagnose, verdict
 from mjx_refine.diagnosis.diagnose import chance
 from mjx_refine.diagnosis.fitted import prior
 from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.slack import impacts, slack_of, spins
-from mjx_refine.diagnosis.verdict import Answer, Signs, answer
+from mjx_refine.diagnosis.verdict import Answer, Signs, answer, signs
 from mjx_refine.effects import batch_with_effects, catalogue
 from mjx_refine.effects.acting import apparent
 from mjx_refine.errors import InputError
@@ -89,6 +90,16 @@ def test_closed_is_what_is_left_of_the_gap():
     assert gap.closed == pytest.approx(0.75)
     assert gap.interval(0) == (pytest.approx(0.75), pytest.approx(0.75))
     assert HeldOut(np.ones(3), np.ones(3), 1.0, 0.0).closed == 0.0
+
+
+def test_what_the_background_shows_counts_whatever_effect_leads_a_little(monkeypatch):
+    monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
+    clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0)
+    base = SimpleNamespace(data=400.0)
+    one = SimpleNamespace(fit=base, lead=22.0, names=("slope",))
+    told = signs(clip, SimpleNamespace(base=base, candidates=(one,), pairs=()), 0.0)
+    assert told.whole == pytest.approx(8.0)
+    assert answer(told, [22.0]).kind == "unknown"
 
 
 SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
