@@ -126,8 +126,8 @@ RIGHT_NONE = {"constant": -0.3, "lead": -0.1}
 RIGHT_NAME = {"constant": -0.35, "margin": 0.15}
 RIGHT_UNKNOWN, RIGHT_PAIR = 0.35, 0.45
 """How often answers are right. All of these were chosen on clips of the withheld exams with seeds 1 and 4
-(benchmarks/withheld), with their mix of effects, the lead that is asked for where residuals look like noise on seed 5; on seed 6
-the stated probabilities were off by 0.035 in the mean."""
+(benchmarks/withheld), with their mix of effects, the lead that is asked for where residuals look like noise on seed 5; on seeds
+6 and 7 the stated probabilities were off by 0.035 and 0.065 in the mean."""
 
 
 @dataclasses.dataclass(frozen=True)
