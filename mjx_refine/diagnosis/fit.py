@@ -122,19 +122,19 @@ class ClipFit:
         found = impacts(batch, poses, self.simulator.fps)
         sharp = self.noise
         long = sustained(batch, poses, touching(batch, poses), self.simulator.fps)
-        kicks = self.kicks(batch, poses, [*found, *long], PART) if found or long else None
         still = self.predictor(poses[None], batch)
+        kicks = self.kicks(batch, poses, still, [*found, *long], PART) if found or long else None
         marks = [(i.target, i.frame) for i in found]
         self._loose = Loose(too_wide(self.measured), kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
         self.set_slackness(self.slackness)
         return len(found)
 
-    def kicks(self, batch: SceneBatch, poses: np.ndarray, found: list[Impact], part: float) -> Parts:
-        """What impacts that err by ``part`` of themselves change in the measurements, one standard deviation a row."""
+    def kicks(self, batch: SceneBatch, poses: np.ndarray, still: Prediction, found: list[Impact], part: float) -> Parts:
+        """What impacts that err by ``part`` of themselves change in what ``still`` predicts, one standard deviation a row."""
         rows = kicked(self.simulator, batch, poses, found, part)
         self.rollouts += len(rows)
         moved = self.predictor(rows, batch.map(lambda a: np.repeat(a[:1], len(rows), 0)))
-        return Parts(*(change[~moved.bad] for change in self._change(moved, self.predictor(poses[None], batch))))
+        return Parts(*(change[~moved.bad] for change in self._change(moved, still)))
 
     def set_slackness(self, slackness: float) -> None:
         """How much contacts may err, as a multiple of what they may in one clip alone."""

@@ -14,10 +14,7 @@ from jaxtyping import Float
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.slack import Impact, spins
 
-KNOCKS = ("hidden_obstacle",)
-"""Effects that are impacts."""
-
-PART = 0.25
+BLOW = 0.25
 """Standard deviation of such an impulse's error, as a part of the change of velocity."""
 
 ROUNDS, ITERATIONS = 2, 8
@@ -31,7 +28,7 @@ def knocked(clip: ClipFit, fit: Fit) -> Fit:
     """The fit once its impacts with unseen things may err; the same where it has none."""
     for _ in range(ROUNDS):
         terms = tuple(
-            dataclasses.replace(t, excused=excuses(clip, fit, k)) if t.name in KNOCKS else t
+            dataclasses.replace(t, excused=excuses(clip, fit, k)) if t.kind.strikes else t
             for k, t in enumerate(fit.hypothesis.terms)
         )
         if all(t.excused is None for t in terms):
@@ -62,4 +59,5 @@ def excuses(clip: ClipFit, fit: Fit, k: int) -> Float[np.ndarray, "residuals col
     turn = (spins(poses, fps)[frame] - spins(plain, fps)[frame])[target]
     size = float(batch.size[0, target].max())
     impact = Impact(target, frame, float(np.linalg.norm(change)), float(np.linalg.norm(turn)) * size)
-    return clip.rigid(clip.kicks(batch, poses, [impact], PART), None, 1e9).T
+    still = clip.predictor(poses[None], batch)
+    return clip.rigid(clip.kicks(batch, poses, still, [impact], BLOW), None, 1e9).T

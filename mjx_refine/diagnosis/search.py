@@ -16,10 +16,10 @@ from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.fitted import Explained
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
-from mjx_refine.diagnosis.screen import Lead, Screen, term_of
+from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.diagnosis.slack import spins, touching
+from mjx_refine.diagnosis.walls import walls_from_pushes
 from mjx_refine.effects import catalogue
-from mjx_refine.effects.hidden_obstacle import HiddenObstacle
 from mjx_refine.effects.kind import FitView
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene
@@ -45,10 +45,6 @@ many effects are fitted again with less."""
 SETTLINGS, SETTLED = 8, 0.8
 """How often the noise is then taken anew from what changes from frame to frame, unless that leaves this part of it: one look
 takes off less than half, and a camera that shakes had made twenty times too much of it."""
-
-TURNS, FACINGS = (-60.0, -45.0, -30.0, -15.0, 0.0, 15.0, 30.0, 45.0, 60.0), 2
-"""How far an obstacle's face may be turned from a push's impulse, since it rubs, where fits look [degree]; from how many
-of these they begin, beside the one that is not turned."""
 
 FORGIVING = 40.0
 """Scale of the robust loss while a fit is far off [noise widths]."""
@@ -223,34 +219,10 @@ def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: Fitted, view: FitView, 
     """An obstacle begins where a push was found."""
     pushes = [(target, *found) for (name, target), found in fitted.items() if name == "push"]
     pushes = [row for row in pushes if row[1].evidence >= base.evidence + 3.0]
-    rows = [(fit, view) for _, fit, _ in pushes]
-    walls = clip.crew.each(clip, _wall_from_push, rows, told, ["hidden_obstacle"] * len(rows))
+    walls = walls_from_pushes(clip, [(fit, view) for _, fit, _ in pushes], told, ["hidden_obstacle"] * len(pushes))
     for (target, _, promise), wall in zip(pushes, walls, strict=True):
         if wall is not None:
             _keep(fitted, ("hidden_obstacle", target), wall, promise)
-
-
-def _wall_from_push(clip: ClipFit, fit: Fit, view: FitView) -> Fit | None:
-    """The fit with an obstacle in the place of its last effect, a push: the wall faces about along the impulse."""
-    *others, push = fit.hypothesis.terms
-    rest = dataclasses.replace(fit.hypothesis, terms=tuple(others))
-    time, x, y, _ = fit.hypothesis.values(fit.z[None], len(others))[0]
-    frame = int(np.clip(round(time * view.fps + 0.25), 0, clip.frames - 1))
-    poses = clip.poses(fit.hypothesis, fit.z[None])[0]
-    if not np.isfinite(poses).all():
-        return None
-    there = dataclasses.replace(view, poses=poses)
-    along = float(np.degrees(np.arctan2(y, x)))
-    moments = sorted({int(np.clip(frame + k, 0, clip.frames - 1)) for k in (-1, 0, 1)})
-    starts = [HiddenObstacle().facing(there, push.target, t, along + turn) for turn in TURNS for t in moments]
-    one = term_of("hidden_obstacle", push.target, dataclasses.replace(starts[0], places=clip.frames), clip.frames)
-    hypothesis = rest.added(one)
-    own = np.array([((start.values - one.centre) / one.width)[one.free] for start in starts])
-    points = np.concatenate([np.repeat(fit.z[None, : rest.dimension], len(own), 0), own], 1)
-    costs = clip.residuals(hypothesis, points)[1].reshape(len(TURNS), -1)
-    facing = {*np.argsort(costs.min(1))[:FACINGS].tolist(), TURNS.index(0.0)}
-    begun = [points[k * len(moments) + int(np.argmin(costs[k]))] for k in sorted(facing)]
-    return max((knocked(clip, clip.fit(hypothesis, z, 9)) for z in begun), key=lambda wall: wall.evidence)
 
 
 def _pairs(
@@ -275,7 +247,7 @@ def _pairs(
         if lead.name == "push" and "hidden_obstacle" in names and one.lead > first.lead
     ]
     lines = [f"{one.names[0]} and hidden_obstacle" for one, _ in pushed]
-    walls = clip.crew.each(clip, _wall_from_push, [(one.fit, view) for one, view in pushed], told, lines)
+    walls = walls_from_pushes(clip, [(one.fit, view) for one, view in pushed], told, lines)
     for wall, (one, _) in zip(walls, pushed, strict=True):
         if wall is not None:
             found.append(Candidate(wall, _lead(wall, base), one.promise))

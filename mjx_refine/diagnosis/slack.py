@@ -194,7 +194,7 @@ def kicked(
     batch: SceneBatch,
     poses: Float[np.ndarray, "frames objects 7"],
     found: list[Impact],
-    part: float = PART,
+    part: float,
 ) -> Float[np.ndarray, "rows frames objects 7"]:
     """Rollouts that go on from each impact with one standard deviation more of velocity or spin, which is ``part`` of its change.
 

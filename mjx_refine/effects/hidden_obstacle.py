@@ -28,6 +28,7 @@ class HiddenObstacle(EffectKind):
     experiment = "Send {target} along the same path again, and along a parallel one: an obstacle stays where it is."
     targeted = True
     physical = True
+    strikes = True
     parameters = (
         EffectParameter("angle", "degree", 15.0, -3600.0, 3600.0, 0.0, None),
         EffectParameter("distance", "m", 0.05, -1e4, 1e4, 0.0, None),

@@ -164,6 +164,7 @@ class EffectKind:
       targeted: whether it acts on one object.
       channel: what of the pictures it changes.
       physical: whether it acts in the rollout (otherwise in how the rollout is seen).
+      strikes: whether it acts as impacts with something unseen, whose impulse nobody knows well.
       drawn: whether it changes outlines (``outline``) or the picture (``warp``).
       parameters: its numbers.
     """
@@ -174,6 +175,7 @@ class EffectKind:
     targeted: ClassVar[bool] = False
     channel: ClassVar[Channel] = "motion"
     physical: ClassVar[bool] = False
+    strikes: ClassVar[bool] = False
     drawn: ClassVar[bool] = False
     parameters: ClassVar[tuple[EffectParameter, ...]]
 

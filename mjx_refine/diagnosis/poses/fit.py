@@ -178,7 +178,8 @@ class PosesFit(ClipFit):
             return 0
         found, long = self._contacts(batch, poses)
         sharp = self.noise
-        kicks = self.kicks(batch, poses, [*found, *long], PART) if found or long else None
+        still = self.predictor(poses[None], batch)
+        kicks = self.kicks(batch, poses, still, [*found, *long], PART) if found or long else None
         always = self._unseen_turns(batch, poses)
         self._loose = Loose(always, kicks, lambda factor: self._blurred(sharp, batch, found, factor))
         self.set_slackness(self.slackness)

@@ -1,0 +1,64 @@
+"""An obstacle in the place of a push: what a push explains, something that the object hits may explain better."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.knock import knocked
+from mjx_refine.diagnosis.screen import term_of
+from mjx_refine.effects.hidden_obstacle import HiddenObstacle
+from mjx_refine.effects.kind import FitView
+
+TURNS, FACINGS = (-60.0, -45.0, -30.0, -15.0, 0.0, 15.0, 30.0, 45.0, 60.0), 2
+"""How far an obstacle's face may be turned from a push's impulse, since it rubs, where fits look [degree]; from how many
+of these they begin, beside the one that is not turned."""
+
+ITERATIONS = 9
+"""Of least squares from each."""
+
+
+def walls_from_pushes(
+    clip: ClipFit, pushes: Sequence[tuple[Fit, FitView]], told: Callable[[str], None], lines: Sequence[str]
+) -> list[Fit | None]:
+    """For each fit, whose last effect is a push, the best with an obstacle in its place; None where its rollout diverged.
+
+    Args:
+      clip: residuals.
+      pushes: the fits, and what is seen of the clip.
+      told: called with the line of a fit that is looked at.
+      lines: one a fit.
+    """
+    begun = clip.crew.each(clip, _facings, pushes, told, lines)
+    fits = iter(clip.crew.each(clip, _wall, [row for rows in begun for row in rows]))
+    return [max((next(fits) for _ in rows), key=lambda wall: wall.evidence, default=None) for rows in begun]
+
+
+def _facings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis, np.ndarray]]:
+    """Where fits with an obstacle begin: it faces about along the push's impulse, about when that was."""
+    *others, push = fit.hypothesis.terms
+    rest = dataclasses.replace(fit.hypothesis, terms=tuple(others))
+    time, x, y, _ = fit.hypothesis.values(fit.z[None], len(others))[0]
+    frame = int(np.clip(round(time * view.fps + 0.25), 0, clip.frames - 1))
+    poses = clip.poses(fit.hypothesis, fit.z[None])[0]
+    if not np.isfinite(poses).all():
+        return []
+    there = dataclasses.replace(view, poses=poses)
+    along = float(np.degrees(np.arctan2(y, x)))
+    moments = sorted({int(np.clip(frame + k, 0, clip.frames - 1)) for k in (-1, 0, 1)})
+    starts = [HiddenObstacle().facing(there, push.target, t, along + turn) for turn in TURNS for t in moments]
+    one = term_of("hidden_obstacle", push.target, dataclasses.replace(starts[0], places=clip.frames), clip.frames)
+    hypothesis = rest.added(one)
+    own = np.array([((start.values - one.centre) / one.width)[one.free] for start in starts])
+    points = np.concatenate([np.repeat(fit.z[None, : rest.dimension], len(own), 0), own], 1)
+    costs = clip.residuals(hypothesis, points)[1].reshape(len(TURNS), -1)
+    facing = {*np.argsort(costs.min(1))[:FACINGS].tolist(), TURNS.index(0.0)}
+    return [(hypothesis, points[k * len(moments) + int(np.argmin(costs[k]))]) for k in sorted(facing)]
+
+
+def _wall(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray) -> Fit:
+    return knocked(clip, clip.fit(hypothesis, z, ITERATIONS))
