@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Motion, Start, glance
+from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Motion, Start, glance, rim_speed
 
 
 class FrictionPatch(EffectKind):
@@ -29,7 +29,9 @@ class FrictionPatch(EffectKind):
 
     def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
         away = np.linalg.norm(motion.position[..., :2] - values[:, None, :2], axis=-1)
-        return glance(motion, float(np.abs(away - values[:, 2:3]).min()))
+        # In a collision spin turns into speed.
+        closing = np.linalg.norm(motion.velocity, axis=-1) + rim_speed(motion)
+        return glance(np.abs(away - values[:, 2:3]), closing.max(-1, keepdims=True))
 
     def starts(self, view: FitView, target: int) -> list[Start]:
         found = []

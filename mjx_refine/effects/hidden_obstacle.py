@@ -10,7 +10,19 @@ from jaxtyping import Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
-from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Loads, Motion, Start, glance, of_target
+from mjx_refine.effects.kind import (
+    GAIN,
+    GLANCE,
+    EffectKind,
+    EffectParameter,
+    FitView,
+    Loads,
+    Motion,
+    Start,
+    glance,
+    of_target,
+    swing,
+)
 
 STIFFNESS = 20000.0
 """Of the wall's contact at most [1/s^2]."""
@@ -53,8 +65,11 @@ class HiddenObstacle(EffectKind):
         return of_target(motion.batch, target, force), of_target(motion.batch, target, rotations.cross(arm, force))
 
     def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
-        gap = -_met(motion, target, values)[2]
-        return glance(motion, float(np.where(gap > 0, gap, 0.0).min()))
+        normal, _, depth = _met(motion, target, values)
+        velocity = motion.velocity[:, target]
+        # The floor may turn a fall into a way to the wall, and so may a body that comes along.
+        closing = np.maximum(-(velocity * normal).sum(-1), 0.0) + np.abs(velocity[:, 2])
+        return glance(-depth, closing + swing(motion, target) + _pushed(motion, target))
 
     def starts(self, view: FitView, target: int) -> list[Start]:
         found = []
@@ -89,10 +104,31 @@ class HiddenObstacle(EffectKind):
 
 def _met(motion: Motion, target: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The wall's normals, the way from the target's centre to its foremost point, and how deep that is in the wall [m]."""
+    # Asked twice at every instant: for how long nothing happens, and for what does.
+    key = ("hidden_obstacle", target, values.tobytes())
+    if key not in motion.known:
+        motion.known[key] = _met_at(motion, target, values)
+    return motion.known[key]
+
+
+def _met_at(motion: Motion, target: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     angle = np.deg2rad(values[:, 0])
     normal = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], -1)
     arm = foremost(motion, target, -normal)
     return normal, arm, values[:, 1] - ((motion.position[:, target] + arm) * normal).sum(-1)
+
+
+def _pushed(motion: Motion, target: int) -> np.ndarray:
+    """Speed of the fastest other body that can meet the target within ``GLANCE``, (batch,) [m/s]."""
+    others = [n for n in range(motion.position.shape[1]) if n != target]
+    if not others:
+        return np.zeros(len(motion.position))
+    speed = np.linalg.norm(motion.velocity, axis=-1)
+    reach = np.linalg.norm(motion.batch.size, axis=-1) + (speed + GLANCE * GAIN / 2) * GLANCE
+    apart = np.linalg.norm(motion.position[:, others] - motion.position[:, target, None], axis=-1)
+    near = apart < reach[:, others] + reach[:, target, None]
+    swept = np.stack([swing(motion, n) for n in others], -1)
+    return np.where(near, speed[:, others] + swept, 0.0).max(-1)
 
 
 def stiffness_of(step: float) -> float:

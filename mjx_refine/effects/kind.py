@@ -7,12 +7,13 @@ An effect acts in one or more places, each a method that a kind may override. Al
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float
 
+from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
 from mjx_refine.errors import InputError
 
@@ -112,6 +113,7 @@ class Motion:
       velocity: of the centres [m/s].
       spin: angular velocity [rad/s].
       batch: sizes, masses, friction.
+      known: what effects have worked out at this instant and will ask again.
     """
 
     time: float
@@ -121,6 +123,7 @@ class Motion:
     velocity: Float[np.ndarray, "batch objects 3"]
     spin: Float[np.ndarray, "batch objects 3"]
     batch: SceneBatch
+    known: dict[Hashable, Any] = dataclasses.field(default_factory=dict, repr=False, compare=False)
 
 
 Loads = tuple[Float[np.ndarray, "batch objects 3"], Float[np.ndarray, "batch objects 3"]]
@@ -321,14 +324,33 @@ def of_target(batch: SceneBatch, target: int, vector: np.ndarray) -> np.ndarray:
     return result
 
 
-GLANCE, GAIN = 0.1, 2.0
-"""Longest time for which nobody looks at where bodies are [s], and the speed that they may gain in it [m/s]: gravity gives
-half of that."""
+GLANCE = 0.1
+"""Longest time for which nobody looks at where bodies are [s]."""
+
+GAIN = 20.0
+"""Acceleration that a body may have meanwhile [m/s^2]: twice that of gravity."""
 
 
-def glance(motion: Motion, gap: float) -> float:
-    """For how long no body can cover ``gap`` [m], surely [s]."""
-    speed = np.linalg.norm(motion.velocity, axis=-1)
-    rim = np.linalg.norm(motion.spin, axis=-1) * np.linalg.norm(motion.batch.size, axis=-1)
-    fastest = float((speed + rim).max())
-    return min(gap / ((0.0 if np.isnan(fastest) else fastest) + GAIN), GLANCE)
+def glance(gap: Float[np.ndarray, "*batch"], closing: Float[np.ndarray, "*batch"] | float) -> float:
+    """For how long nothing that closes in at speeds ``closing`` [m/s] can cover ``gap`` [m], surely [s]."""
+    gap = np.maximum(gap, 0.0)
+    time = (np.sqrt(closing * closing + 2 * GAIN * gap) - closing) / GAIN
+    # What has diverged goes nowhere.
+    return float(np.min(time, initial=GLANCE, where=np.isfinite(time)))
+
+
+def rim_speed(motion: Motion) -> Float[np.ndarray, "batch objects"]:
+    """How fast spin moves what lies farthest from a body's centre, at most [m/s]."""
+    return np.linalg.norm(motion.spin, axis=-1) * np.linalg.norm(motion.batch.size, axis=-1)
+
+
+def swing(motion: Motion, target: int) -> Float[np.ndarray, "batch"]:
+    """How fast spin moves a body's outline at most [m/s]: a ball's and a rolling cylinder's stays where it is."""
+    shape = motion.batch.shapes[target]
+    if shape == "sphere":
+        return np.zeros(len(motion.spin))
+    spin = motion.spin[:, target]
+    if shape == "cylinder":
+        axis = rotations.matrix(motion.quaternion[:, target])[..., 2]
+        spin = spin - (spin * axis).sum(-1, keepdims=True) * axis
+    return np.linalg.norm(spin, axis=-1) * np.linalg.norm(motion.batch.size[:, target], axis=-1)

@@ -210,3 +210,49 @@ def test_steps_taken_together_end_where_single_ones_do(entry, monkeypatch):
     monkeypatch.setattr(acting, "idle", lambda batch, motion: 0.0)
     np.testing.assert_allclose(together, rolled_out(entry, **state), atol=1e-4)
     assert np.abs(together - rolled_out(**state)).max() > 0.05
+
+
+SIZES = {"sphere": (0.15,), "box": (0.1, 0.15, 0.2), "cylinder": (0.12, 0.2)}
+
+
+def tumble_at_a_wall(seed: int) -> Scene:
+    """A body that falls, spins and flies to a wall, and another that comes behind it."""
+    generator = np.random.default_rng(seed)
+
+    def thrown(name: str, x: float) -> Body:
+        shape = str(generator.choice(list(SIZES)))
+        turn = rotations.normalise(generator.normal(size=4))
+        return Body(
+            shape,
+            name,
+            SIZES[shape],
+            (x, generator.uniform(-0.1, 0.1), generator.uniform(0.3, 0.5)),
+            tuple(turn),
+            linear_velocity=(generator.uniform(-3, 0), generator.uniform(-0.5, 0.5), generator.uniform(-1, 1)),
+            angular_velocity=tuple(generator.normal(0, 4, 3)),
+        )
+
+    bodies = thrown("one", 0.0), thrown("two", generator.uniform(0.5, 0.9))
+    angle, distance = generator.uniform(-40, 40), generator.uniform(-0.8, -0.4)
+    wall = effect("hidden_obstacle", "one", angle=angle, distance=distance, restitution=0.5)
+    return Scene(bodies, CAMERA, (0.0, 0.0, -GRAVITY), (wall,))
+
+
+def test_a_wall_is_looked_at_seldom_and_never_too_late(monkeypatch):
+    """Steps together differ from single ones by the solver's first guess alone, which bounces let grow."""
+    scenes, looks, idle = [tumble_at_a_wall(seed) for seed in range(30)], [0, 0], acting.idle
+
+    def run(each: int) -> np.ndarray:
+        def counted(batch, motion):
+            looks[each] += 1
+            return 0.0 if each else idle(batch, motion)
+
+        monkeypatch.setattr(acting, "idle", counted)
+        return np.array(
+            [MujocoSimulator(s.shapes, FPS, 1).rollout(batch_with_effects([s]), 16)[0, ..., :3] for s in scenes]
+        )
+
+    apart = np.abs(run(0) - run(1)).max((1, 2, 3))
+    assert np.median(apart) < 1e-6
+    assert np.quantile(apart, 0.9) < 1e-4
+    assert looks[0] < 0.4 * looks[1]
