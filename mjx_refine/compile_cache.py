@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import logging
 import os
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
 import jax
 
@@ -16,6 +17,8 @@ log = logging.getLogger("mjx_refine")
 
 VARIABLE = "MJX_REFINE_CACHE"
 """Environment variable that names the cache folder; ``off`` turns the caches off."""
+
+_KERNELS: dict[str, str] = {}
 
 
 def cache_folder() -> Path | None:
@@ -47,10 +50,17 @@ def enable_cache() -> Path | None:
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-    if importlib.util.find_spec("warp") is not None:
-        warp = importlib.import_module("warp")
-        warp.config.kernel_cache_dir = str(folder / "warp")
+    _KERNELS["folder"] = str(folder / "warp")
+    if "warp" in sys.modules:
+        keep_kernels(sys.modules["warp"])
     return folder
+
+
+def keep_kernels(warp: ModuleType) -> None:
+    """Makes Warp, just imported, keep its kernels where ``enable_cache`` said: it is imported by those alone who need it, since
+    that takes seconds."""
+    if "folder" in _KERNELS:
+        warp.config.kernel_cache_dir = _KERNELS["folder"]
 
 
 @contextlib.contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
 
 from mjx_fitness.pictures import UNMATCHED
 
@@ -20,6 +19,9 @@ def match_costs(costs: Float[np.ndarray, "objects masks"], ids: list[int], limit
     Returns:
       for each object its mask's id, or ``UNMATCHED``.
     """
+    # Imported here, because it takes half a second.
+    from scipy.optimize import linear_sum_assignment
+
     costs = np.asarray(costs, np.float64)
     matching = [UNMATCHED] * costs.shape[0]
     if costs.size == 0:

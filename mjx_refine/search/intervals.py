@@ -19,7 +19,7 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import stats
+from scipy import special
 
 from mjx_refine.search.landing import LeastSquares, slowed
 from mjx_refine.search.noise import DRAWS, TREMBLE, Noise, measured, unmeasured
@@ -287,7 +287,7 @@ def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refi
         gauge, gauge
     )
     error = np.minimum(np.sqrt(np.diag(covariance)), 1.0)
-    reach = stats.t.ppf(0.5 + CONFIDENCE / 2, refits) * error * sigma
+    reach = special.stdtrit(refits, 0.5 + CONFIDENCE / 2) * error * sigma
     edge = (best.point < ON_BOUND) | (best.point > 1 - ON_BOUND)
     return Intervals(
         point=best.point,

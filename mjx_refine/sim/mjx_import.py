@@ -8,9 +8,12 @@ import importlib.util
 import io
 from types import ModuleType
 
+from mjx_refine.compile_cache import keep_kernels
+
 if importlib.util.find_spec("warp") is not None:
     warp = importlib.import_module("warp")
     warp.config.log_level = warp.LOG_WARNING
+    keep_kernels(warp)
 
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
