@@ -55,7 +55,7 @@ def resolve_backend(name: str) -> str:
         return name
     if os.environ.get(OFFERED) == "warp":
         return "warp"
-    from mjx_refine.sim.warp import REMEDY, warp_problem
+    from mjx_refine.sim.warp_problem import REMEDY, warp_problem
 
     problem = warp_problem()
     if problem and name == "warp":

@@ -19,11 +19,10 @@ from mjx_refine.scene import Shape
 from mjx_refine.sim.carried import carried, refuse_loads
 from mjx_refine.sim.mjx import Launched, bucket, diverged_to_nan
 from mjx_refine.sim.model import IDLE, build_spec, contact_pairs, field_arrays, initial_state, model_fields
+from mjx_refine.sim.warp_problem import REMEDY, warp_problem
 
 if TYPE_CHECKING:
     from mjx_refine.sim.worlds import Worlds
-
-REMEDY = "pip install 'mjx-refine[warp]' on a machine with an NVIDIA GPU, or choose --backend mujoco"
 
 _ITERATION_WARNINGS = (1 << 9) | (1 << 10)
 """Warp's ``OverflowType.ITERATIONS`` and ``LS_ITERATIONS``."""
@@ -39,17 +38,6 @@ KEPT = 4
 """Worlds of a scene kind that are kept."""
 
 _POINTS = {("floor", "sphere"): 1, ("floor", "box"): 8, ("floor", "cylinder"): 4}
-
-
-def warp_problem() -> str | None:
-    """Why MJX-Warp cannot run here, or None where it can."""
-    if importlib.util.find_spec("warp") is None:
-        return "the package warp-lang is not installed"
-    try:
-        found = jax.devices("cuda")
-    except RuntimeError:
-        found = []
-    return None if found else "JAX sees no NVIDIA GPU"
 
 
 def contact_points(shapes: tuple[Shape, ...]) -> int:

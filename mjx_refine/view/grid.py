@@ -25,7 +25,11 @@ from mjx_refine.view.rays import cast
 from mjx_refine.view.tiles import foreground
 
 CHUNKS = (128, 64, 32, 16)
-"""Candidates of one clip in one kernel; a clip's candidates are padded to a multiple."""
+"""Candidates of one clip in one kernel, at most; a clip's candidates are padded to a multiple."""
+
+MOST = 1 << 27
+"""Samples of all frames of a chunk, unless one candidate has more: of many objects XLA keeps a dozen numbers for each sample
+at a time, half a gigabyte each."""
 
 SPARE = 1.1
 """Padding may cost this factor; smaller chunks are taken where it costs more."""
@@ -203,7 +207,7 @@ class GridScorer:
             raise ValueError(f"counts add up to {sum(counts)}; expected the batch's {total}, and one a clip")
         if counts not in self._layouts:
             self._layouts.clear()
-            self._layouts[counts] = _laid_out(counts, self._used)
+            self._layouts[counts] = _laid_out(counts, self._used, max(1, MOST // self._clips.ids[0].size))
         return self._layouts[counts]
 
 
@@ -228,9 +232,13 @@ class _Layout:
     owner: Int[np.ndarray, "batch"]
 
 
-def _laid_out(counts: tuple[int, ...], used: set[tuple[int, int, int]]) -> _Layout:
-    """A layout, of the sizes of one that was used before where it has room and not too much of it; adds to ``used``."""
+def _laid_out(counts: tuple[int, ...], used: set[tuple[int, int, int]], most: int = CHUNKS[0]) -> _Layout:
+    """A layout, of the sizes of one that was used before where it has room and not too much of it; adds to ``used``.
+
+    ``most``: candidates that there is memory for in one chunk.
+    """
     total = sum(counts)
+    sizes = [chunk for chunk in CHUNKS if chunk <= most] or [1 << (most.bit_length() - 1)]
 
     def chunks_of(chunk: int) -> int:
         return sum(-(-count // chunk) for count in counts)
@@ -239,7 +247,7 @@ def _laid_out(counts: tuple[int, ...], used: set[tuple[int, int, int]]) -> _Layo
     if before:
         chunk, number, rows = min(before, key=lambda u: u[0] * u[1])
     else:
-        chunk = next((c for c in CHUNKS if chunks_of(c) * c <= SPARE * total), CHUNKS[-1])
+        chunk = next((c for c in sizes if chunks_of(c) * c <= SPARE * total), sizes[-1])
         number, rows = _few(chunks_of(chunk)), 16 * _few(-(-total // 16))
         used.add((chunk, number, rows))
     row, clip, place, first = np.zeros(chunk * number, np.int32), np.zeros(number, np.int32), [], 0

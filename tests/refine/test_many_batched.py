@@ -222,6 +222,30 @@ def test_grids_of_different_clips_are_refused(clips):
         scorer.score(np.zeros((4, FRAMES, 1, 7)), batch, [3])  # type: ignore[arg-type]
 
 
+def test_large_pictures_are_compared_a_few_candidates_at_a_time(clips, monkeypatch):
+    """What a kernel holds stays below a limit, and scores are the same."""
+    observation = load_observation(clips[0] / "flows.npz")
+    space = Space.around(load_scenes(clips[0] / "best32.yaml")[0])
+    generator = np.random.default_rng(3)
+    points = space.start + space.sigma * generator.normal(size=(20, space.dimension))
+    batch = space.decode(np.clip(points, 0, 1))
+    poses = MujocoSimulator(batch.shapes, observation.fps, 1).rollout(batch, observation.length)
+    clip = sampled(observation, (1,))
+
+    def scored() -> tuple[int, np.ndarray]:
+        monkeypatch.setattr(grid, "_USED", {})
+        scorer = GridScorer(batch.shapes, [clip])
+        scores = scorer(poses, batch)
+        return scorer._layout((20,), 20).chunk, scores.fitness
+
+    whole, fitness = scored()
+    assert whole == 16
+    monkeypatch.setattr(grid, "MOST", 5 * clip.ids.size)
+    few, again = scored()
+    assert few == 4
+    np.testing.assert_allclose(again, fitness, rtol=1e-5)
+
+
 def test_clips_that_leave_keep_their_room(clips):
     observations = [load_observation(clip / "flows.npz") for clip in clips]
     scorer = GridScorer(("sphere",), [sampled(one, (1,), (48, 32)) for one in observations])
