@@ -22,8 +22,8 @@ from mjx_refine.view.outline import Arrays, directions, place, support_of
 from mjx_refine.view.points import point_flow_function
 from mjx_refine.view.seen import changed_moments, outline_function
 
-SIZES = (8, 128)
-"""Batch sizes that are compiled."""
+SIZES = (8, 48)
+"""Batch sizes that are compiled: a line search, and the derivatives of two objects with an effect. More are cut up."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,15 +90,8 @@ class Predictor:
         poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
         seen = acting.apparent(poses, batch, self.fps)
         drawn = acting.changes_outlines(batch)
-        arrays = (seen, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
-        size = next((b for b in SIZES if b >= len(poses)), -(-len(poses) // SIZES[-1]) * SIZES[-1])
-        device = tuple(
-            jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32) for a in arrays
-        )
-        told, whole, flow = _predict(self.shapes, device, jnp.asarray(self.pixels, jnp.float32), self.image, drawn)
-        told = [np.asarray(a, np.float64)[: len(poses)] for a in told]
-        whole = np.asarray(whole, np.float64)[: len(poses)]
-        flow = np.asarray(flow, np.float64)[: len(poses), :-1]
+        told, whole, flow = self._predicted(seen, batch, drawn)
+        flow = flow[:, :-1]
         reach = told[0]
         if drawn:
             focal = (self.image[1] / 2) / np.tan(batch.camera_fovy / 2)
@@ -111,6 +104,21 @@ class Predictor:
             whole = changed_moments(whole, batch, view, change)
             flow = self._seen_flow(flow, batch, focal)
         return Prediction(reach, flow, whole, self._background(batch, len(poses), poses.shape[1]), bad)
+
+    def _predicted(self, seen: np.ndarray, batch: SceneBatch, drawn: bool):
+        """``_predict`` of rows by batches of ``SIZES``."""
+        arrays = (seen, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
+        pixels, found = jnp.asarray(self.pixels, jnp.float32), []
+        for first in range(0, len(seen), SIZES[-1]):
+            rows = [a[first : first + SIZES[-1]] for a in arrays]
+            size = next(b for b in SIZES if b >= len(rows[0]))
+            device = tuple(
+                jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32) for a in rows
+            )
+            # What follows is prepared while this is computed.
+            found.append((len(rows[0]), _predict(self.shapes, device, pixels, self.image, drawn)))
+        parts = [jax.tree.map(lambda a, n=n: np.asarray(a, np.float64)[:n], one) for n, one in found]
+        return parts[0] if len(parts) == 1 else jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
     def warm(self, frames: int) -> None:
         """Compiles predictions of clips of so many frames."""

@@ -66,10 +66,13 @@ class HiddenObstacle(EffectKind):
 
     def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
         normal, _, depth = _met(motion, target, values)
+        if (depth >= 0).any():
+            return 0.0
         velocity = motion.velocity[:, target]
         # The floor may turn a fall into a way to the wall, and so may a body that comes along.
-        closing = np.maximum(-(velocity * normal).sum(-1), 0.0) + np.abs(velocity[:, 2])
-        return glance(-depth, closing + swing(motion, target) + _pushed(motion, target))
+        closing = np.maximum(-(velocity * normal).sum(-1), 0.0) + np.abs(velocity[:, 2]) + swing(motion, target)
+        alone = glance(-depth, closing)
+        return alone if alone < 2 * motion.step else glance(-depth, closing + _pushed(motion, target))
 
     def starts(self, view: FitView, target: int) -> list[Start]:
         found = []
@@ -167,7 +170,7 @@ def foremost(motion: Motion, target: int, direction: np.ndarray) -> np.ndarray:
     shape, size = motion.batch.shapes[target], motion.batch.size[:, target]
     if shape == "sphere":
         return size[:, :1] * direction
-    matrix = rotations.matrix(motion.quaternion[:, target])
+    matrix = motion.axes[:, target]
     local = np.einsum("bij,bi->bj", matrix, direction)
     if shape == "box":
         # Flat faces touch at their middle: the sign turns to zero where the face is square to the wall.

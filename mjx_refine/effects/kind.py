@@ -125,6 +125,13 @@ class Motion:
     batch: SceneBatch
     known: dict[Hashable, Any] = dataclasses.field(default_factory=dict, repr=False, compare=False)
 
+    @property
+    def axes(self) -> Float[np.ndarray, "batch objects 3 3"]:
+        """Body to world."""
+        if "axes" not in self.known:
+            self.known["axes"] = rotations.matrix(self.quaternion)
+        return self.known["axes"]
+
 
 Loads = tuple[Float[np.ndarray, "batch objects 3"], Float[np.ndarray, "batch objects 3"]]
 """Forces [N] and torques [N m] about the bodies' centres, world frame."""
@@ -351,6 +358,6 @@ def swing(motion: Motion, target: int) -> Float[np.ndarray, "batch"]:
         return np.zeros(len(motion.spin))
     spin = motion.spin[:, target]
     if shape == "cylinder":
-        axis = rotations.matrix(motion.quaternion[:, target])[..., 2]
+        axis = motion.axes[:, target, :, 2]
         spin = spin - (spin * axis).sum(-1, keepdims=True) * axis
     return np.linalg.norm(spin, axis=-1) * np.linalg.norm(motion.batch.size[:, target], axis=-1)

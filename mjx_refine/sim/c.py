@@ -20,6 +20,10 @@ from mjx_refine.sim.stepped import stepped_rollout
 # MuJoCo's default handler appends to MUJOCO_LOG.TXT in the working directory. A candidate that diverges is no news.
 mujoco.set_mju_user_warning(lambda _message: None)
 
+FEW_STEPS = 24
+"""Steps, times candidates, for which waking threads takes longer than they save: that takes some 50 us, a step in the air 2 us
+and one on the floor 20."""
+
 
 class MujocoSimulator:
     """Batched rollouts in C MuJoCo; models are built once and edited in place.
@@ -42,12 +46,14 @@ class MujocoSimulator:
         self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
         self._edited: list[Edited] = []
         self._off_centre: tuple[mujoco.MjModel, list[mujoco.MjData], list[Edited]] | None = None
-        self._threads: rollout.Rollout | None = None
+        self._workers: dict[int, rollout.Rollout] = {}
 
-    def _pool(self) -> rollout.Rollout:
-        if self._threads is None:
-            self._threads = rollout.Rollout(nthread=self.threads if self.threads > 1 else 0)
-        return self._threads
+    def _workers_for(self, steps: int) -> rollout.Rollout:
+        """Threads for so many steps of single candidates; this one alone for few."""
+        threads = self.threads if self.threads > 1 and steps >= FEW_STEPS else 0
+        if threads not in self._workers:
+            self._workers[threads] = rollout.Rollout(nthread=threads)
+        return self._workers[threads]
 
     def _compiled(self, off_centre: bool) -> mujoco.MjModel:
         model = build_spec(self.shapes, self.fps, off_centre=off_centre).compile()
@@ -98,9 +104,11 @@ class MujocoSimulator:
         state = np.zeros((len(batch), size))
         state[:, 1 : 1 + qpos.shape[1] + qvel.shape[1]] = np.concatenate([qpos, qvel], 1)
         if batch.effects and acting.has_loads(batch):
-            later = stepped_rollout(self._pool(), models, data, state, batch, frames, world)
+            later = stepped_rollout(self._workers_for, models, data, state, batch, frames, world)
         else:
-            states, _ = self._pool().rollout(models, data, state, nstep=(frames - 1) * SUBSTEPS)
+            steps = (frames - 1) * SUBSTEPS
+            workers = self._workers_for(steps * len(batch))
+            states, _ = workers.rollout(models, data[: workers.nthread or 1], state, nstep=steps)
             later = np.asarray(states)[:, SUBSTEPS - 1 :: SUBSTEPS, 1 : 1 + qpos.shape[1]]
         return np.concatenate([first, later], 1)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +17,7 @@ from mjx_refine.sim.model import SUBSTEPS
 
 
 def stepped_rollout(
-    pool: rollout.Rollout,
+    workers_for: Callable[[int], rollout.Rollout],
     models: list[mujoco.MjModel],
     data: list[mujoco.MjData],
     state: Float[np.ndarray, "batch state"],
@@ -29,7 +31,7 @@ def stepped_rollout(
     every effect says that its loads stay as they are, steps are taken together.
 
     Args:
-      pool: threads.
+      workers_for: threads for so many steps of single candidates.
       models: one a candidate; the floor's friction is written into them and put back.
       data: one a thread.
       state: full physics state at the first frame.
@@ -66,9 +68,10 @@ def stepped_rollout(
             current = wanted
         # Checks of shapes would take as long as a step.
         states, nothing = np.empty((count, steps, state.shape[1])), np.empty((count, steps, 0))
-        pool.rollout(
+        workers = workers_for(count * steps)
+        workers.rollout(
             models,
-            data,
+            data[: workers.nthread or 1],
             state,
             np.repeat(applied.reshape(count, 1, -1), steps, 1),
             control_spec=spec,
@@ -99,9 +102,11 @@ def _motion(state: np.ndarray, batch: SceneBatch, time: float, step: float, worl
     qpos = state[:, 1 : 1 + 7 * objects].reshape(count, objects, 7)
     qvel = state[:, 1 + 7 * objects : 1 + 13 * objects].reshape(count, objects, 6)
     position, quaternion, velocity = qpos[..., :3], qpos[..., 3:], qvel[..., :3]
-    spin = rotations.rotate(quaternion, qvel[..., 3:])
+    axes = rotations.matrix(quaternion)
+    spin = (axes * qvel[..., None, 3:]).sum(-1)
     if world is not None:
         position, velocity, spin = (np.einsum("bij,bnj->bni", world, v) for v in (position, velocity, spin))
         turn = np.broadcast_to(acting.quaternion_of(world)[:, None], quaternion.shape)
         quaternion = rotations.multiply(turn, quaternion)
-    return Motion(time, step, position, quaternion, velocity, spin, batch)
+        axes = world[:, None] @ axes
+    return Motion(time, step, position, quaternion, velocity, spin, batch, {"axes": axes})
