@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -270,3 +272,20 @@ def test_warp_parity(row):
 
     (measured,) = run("warp", 16, 0, [row], [-4.0])
     assert measured.verdict in ("ok", "stated")
+
+
+def test_who_searches_on_the_cores_imports_neither_mjx_nor_warp():
+    """They take seconds, of which a second process has few."""
+    said = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", STARTED], capture_output=True, text=True, check=True, timeout=120
+    )
+    assert said.stdout.split() == ["mujoco"]
+
+
+STARTED = """
+import sys
+from mjx_refine import load_observation, load_scenes, refine
+from mjx_refine.sim.backends import fastest
+print(fastest("auto", 1))
+print(*[name for name in ("mujoco.mjx", "warp", "scipy.stats", "scipy.optimize") if name in sys.modules])
+"""

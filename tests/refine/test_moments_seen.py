@@ -39,6 +39,21 @@ def seen_moments(poses: np.ndarray, batch: SceneBatch) -> np.ndarray:
     return Predictor(batch.shapes, nowhere, np.zeros((1, 2)), SIZE, FPS)(poses, batch).moments
 
 
+def test_many_candidates_are_predicted_a_batch_at_a_time():
+    scenes = [
+        dataclasses.replace(SCENE, camera=dataclasses.replace(SCENE.camera, fovy=40.0 + k / 8)) for k in range(60)
+    ]
+    batch = batch_with_effects(scenes)
+    poses = MujocoSimulator(batch.shapes, FPS, 1).rollout(batch, 4)
+    together = seen_moments(poses, batch)
+    assert together.shape == (60, 4, 2, 3)
+    for row in (0, 47, 48, 59):
+        np.testing.assert_allclose(
+            together[row], seen_moments(poses[row : row + 1], batch[row : row + 1])[0], atol=1e-3
+        )
+    assert np.ptp(together[:, 0, 0, 2]) > 1.0
+
+
 SEEN = (
     effect("camera_motion", pan=20.0, x=0.4),
     effect("lens_distortion", k1=0.25),
