@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 import cv2
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from effect_scenes import effect
@@ -19,8 +21,10 @@ from mjx_refine.search import Options, refine
 from mjx_refine.search.problem import Problem
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.simulate import simulate
+from mjx_refine.view import rows
 from mjx_refine.view.effects import draw_effects, needs_pictures
 from mjx_refine.view.exposure import poses_at, straightened
+from mjx_refine.view.frames import make_frames
 from mjx_refine.view.picture import draw
 from mjx_refine.view.picture_scorer import PictureScorer
 from mjx_refine.view.seen import seen_point_flow, seen_supports
@@ -428,3 +432,29 @@ def test_without_effects_the_pictures_are_the_plain_ones():
     for one, other in zip(draw_effects(poses[0], batch, SIZE, FPS), draw(poses[0], batch, SIZE), strict=True):
         np.testing.assert_array_equal(one, other)
     assert not needs_pictures(batch_of(effect("drag", "ball", linear=1.0)))
+
+
+def test_only_the_rectangles_around_outlines_are_looked_at(monkeypatch):
+    """What is drawn there, few points at a time, is what looking at every point draws."""
+    batch = batch_of()
+    poses = np.concatenate([batch.position, batch.quaternion], -1)[:, None].repeat(2, 1)
+    floor = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (1, 2, 1, 1))
+    size = np.concatenate([batch.size, np.zeros((1, 1, 3))], 1)
+    seen_from = batch.camera_position, batch.camera_pitch, batch.camera_fovy
+    frames = make_frames(*map(jnp.asarray, (np.concatenate([poses, floor], 2), size, *seen_from)), SIZE[1])
+    frames = jax.tree.map(lambda a: a[::2], frames)
+    arrays = tuple(jnp.asarray(a) for a in (poses[:, :1], batch.size, *seen_from))
+    x, y = np.meshgrid(np.arange(0.5, SIZE[0], 2), np.arange(0.5, SIZE[1], 2))
+    at = jnp.asarray(np.stack([x.ravel(), y.ravel()], -1), jnp.float32)
+    change = np.random.default_rng(0).normal(0, 4, (2, 16))
+    some_hidden = np.where(np.arange(2)[:, None] == 1, np.nan, change)
+    for added, seen in ((change, {0, 1, 2}), (some_hidden, {0, 1})):
+        told = jnp.asarray(added, jnp.float32)
+        distance = rows._changed_distance(batch.shapes, arrays, at, SIZE, told)
+        centre = SIZE[0] / 2, SIZE[1] / 2
+        whole = rows._cast_outlines(batch.shapes, frames, at[None, :, 0], at[None, :, 1], centre, distance)
+        monkeypatch.setattr(rows, "PART", 100)
+        parts = rows._changed_outlines(batch.shapes, frames, arrays, at, SIZE, told)
+        for one, other in zip(parts, whole, strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-3)
+        assert set(np.unique(whole[0]).tolist()) == seen
