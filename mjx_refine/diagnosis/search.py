@@ -137,6 +137,7 @@ def _singles(
     clip: ClipFit, base: Fit, names, scene, observation, masks_of, seed: int, told: Told
 ) -> tuple[Fit, tuple[Candidate, ...]]:
     fitted: Fitted = {}
+    walled: list[Fit] = []
     zero = clip.at(base.hypothesis, np.zeros(base.hypothesis.dimension), scale=FORGIVING)
     for again in range(2):
         told("looking ahead")
@@ -151,7 +152,7 @@ def _singles(
         for (_, lead), fit in zip(rows, clip.crew.each(clip, _fit_lead, rows, told, lines), strict=True):
             _keep(fitted, (lead.name, lead.target), fit, lead.gain)
         if "hidden_obstacle" in names:
-            _walls_from_pushes(clip, base, fitted, view, told)
+            _walls_from_pushes(clip, base, fitted, walled, view, told)
         best = max((fit for fit, _ in fitted.values()), key=lambda fit: fit.evidence, default=base)
         # What an effect's fit found for the base parameters may serve the base model as well.
         other = clip.fit(base.hypothesis, best.z[: base.hypothesis.dimension], 8) if fitted else base
@@ -215,10 +216,11 @@ def _begin(clip: ClipFit, hypothesis: Hypothesis, base: Fit, lead: Lead, z: np.n
     return clip.best_of(hypothesis, np.array([np.concatenate([base.z + a * limited, a * z]) for a in parts]))
 
 
-def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: Fitted, view: FitView, told: Told) -> None:
-    """An obstacle begins where a push was found."""
+def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: Fitted, walled: list[Fit], view: FitView, told: Told) -> None:
+    """An obstacle begins where a push was found; ``walled`` are those pushes for which that was done before."""
     pushes = [(target, *found) for (name, target), found in fitted.items() if name == "push"]
-    pushes = [row for row in pushes if row[1].evidence >= base.evidence + 3.0]
+    pushes = [row for row in pushes if row[1].evidence >= base.evidence + 3.0 and not any(row[1] is w for w in walled)]
+    walled += [fit for _, fit, _ in pushes]
     walls = walls_from_pushes(clip, [(fit, view) for _, fit, _ in pushes], told, ["hidden_obstacle"] * len(pushes))
     for (target, _, promise), wall in zip(pushes, walls, strict=True):
         if wall is not None:
