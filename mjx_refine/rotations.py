@@ -41,7 +41,12 @@ def matrix(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
 
 def rotate(q: Float[np.ndarray, "*batch 4"], v: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
     """``v`` rotated by ``q``."""
-    return (matrix(q) * v[..., None, :]).sum(-1)
+    return turned(matrix(q), v)
+
+
+def turned(axes: Float[np.ndarray, "*batch 3 3"], v: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """``v`` rotated by matrices."""
+    return (axes * v[..., None, :]).sum(-1)
 
 
 def conjugate(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]:

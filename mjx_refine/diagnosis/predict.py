@@ -18,7 +18,7 @@ from mjx_refine.effects.kind import OutlineView
 from mjx_refine.scene import Shape
 from mjx_refine.search.features import DIRECTIONS
 from mjx_refine.view.moments import whole_function
-from mjx_refine.view.outline import Arrays, directions, place, support_of
+from mjx_refine.view.outline import Arrays, directions, padded, place, support_of
 from mjx_refine.view.points import point_flow_function
 from mjx_refine.view.seen import changed_moments, outline_function
 
@@ -107,16 +107,12 @@ class Predictor:
 
     def _predicted(self, seen: np.ndarray, batch: SceneBatch, drawn: bool):
         """``_predict`` of rows by batches of ``SIZES``."""
-        arrays = (seen, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
         pixels, found = jnp.asarray(self.pixels, jnp.float32), []
         for first in range(0, len(seen), SIZES[-1]):
-            rows = [a[first : first + SIZES[-1]] for a in arrays]
-            size = next(b for b in SIZES if b >= len(rows[0]))
-            device = tuple(
-                jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32) for a in rows
-            )
+            rows = slice(first, min(first + SIZES[-1], len(seen)))
+            device = padded(seen[rows], batch[rows], SIZES)
             # What follows is prepared while this is computed.
-            found.append((len(rows[0]), _predict(self.shapes, device, pixels, self.image, drawn)))
+            found.append((rows.stop - first, _predict(self.shapes, device, pixels, self.image, drawn)))
         parts = [jax.tree.map(lambda a, n=n: np.asarray(a, np.float64)[:n], one) for n, one in found]
         return parts[0] if len(parts) == 1 else jax.tree.map(lambda *a: np.concatenate(a), *parts)
 

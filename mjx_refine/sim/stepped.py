@@ -103,7 +103,7 @@ def _motion(state: np.ndarray, batch: SceneBatch, time: float, step: float, worl
     qvel = state[:, 1 + 7 * objects : 1 + 13 * objects].reshape(count, objects, 6)
     position, quaternion, velocity = qpos[..., :3], qpos[..., 3:], qvel[..., :3]
     axes = rotations.matrix(quaternion)
-    spin = (axes * qvel[..., None, 3:]).sum(-1)
+    spin = rotations.turned(axes, qvel[..., 3:])
     if world is not None:
         position, velocity, spin = (np.einsum("bij,bnj->bni", world, v) for v in (position, velocity, spin))
         turn = np.broadcast_to(acting.quaternion_of(world)[:, None], quaternion.shape)

@@ -28,8 +28,8 @@ CHUNKS = (128, 64, 32, 16)
 """Candidates of one clip in one kernel, at most; a clip's candidates are padded to a multiple."""
 
 MOST = 1 << 27
-"""Samples of all frames of a chunk, unless one candidate has more: of many objects XLA keeps a dozen numbers for each sample
-at a time, half a gigabyte each."""
+"""Samples of all frames of a chunk, unless one candidate has more: of four objects XLA kept eight numbers for each sample at a
+time, half a gigabyte each here."""
 
 SPARE = 1.1
 """Padding may cost this factor; smaller chunks are taken where it costs more."""

@@ -188,6 +188,19 @@ def support_function(
     return jnp.stack([support_of(shape, placed, n, normals) for n, shape in enumerate(shapes)], 2) + middle
 
 
+def padded(
+    poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch, sizes: tuple[int, ...] = BATCHES
+) -> Arrays:
+    """Poses, sizes and cameras on the device, rows added up to the next of ``sizes`` or a multiple of the last.
+
+    Few sizes are ever compiled: searches ask for batches of many lengths.
+    """
+    arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
+    size = next((b for b in sizes if b >= len(poses)), -(-len(poses) // sizes[-1]) * sizes[-1])
+    longer = (np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]) for a in map(np.asarray, arrays))
+    return tuple(jnp.asarray(a, jnp.float32) for a in longer)  # type: ignore[return-value]
+
+
 _support_function = jax.jit(support_function, static_argnums=(0, 2, 3))
 
 
@@ -199,9 +212,4 @@ def supports(
     The support function of a convex outline, h(n) = max over its points p of n . p (Schneider, Convex Bodies, 1.7).
     Occlusion and the image's border do not matter to it.
     """
-    arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
-    # Few sizes are ever compiled: a search asks for batches of many lengths.
-    size = next((b for b in BATCHES if b >= len(poses)), -(-len(poses) // BATCHES[-1]) * BATCHES[-1])
-    padded = [np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]) for a in map(np.asarray, arrays)]
-    device = tuple(jnp.asarray(a, jnp.float32) for a in padded)
-    return np.asarray(_support_function(batch.shapes, device, count, image))[: len(poses)]
+    return np.asarray(_support_function(batch.shapes, padded(poses, batch), count, image))[: len(poses)]

@@ -11,7 +11,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.scene import Shape
 from mjx_refine.view.distance import surface
 from mjx_refine.view.frames import make_frames
-from mjx_refine.view.outline import BATCHES, Arrays, larger
+from mjx_refine.view.outline import Arrays, larger, padded
 
 
 def point_flow_function(
@@ -54,10 +54,5 @@ def point_flow(
 
     Where the ray misses the object, that of a point fixed to it beside its outline; zero in the last frame.
     """
-    arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
-    size = next((b for b in BATCHES if b >= len(poses)), -(-len(poses) // BATCHES[-1]) * BATCHES[-1])
-    padded = tuple(
-        jnp.asarray(np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]), jnp.float32)
-        for a in map(np.asarray, arrays)
-    )
-    return np.asarray(_point_flow(batch.shapes, padded, jnp.asarray(pixels, jnp.float32), image))[: len(poses)]
+    told = _point_flow(batch.shapes, padded(poses, batch), jnp.asarray(pixels, jnp.float32), image)
+    return np.asarray(told)[: len(poses)]

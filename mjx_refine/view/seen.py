@@ -13,7 +13,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting
 from mjx_refine.effects.kind import OutlineView
 from mjx_refine.scene import Shape
-from mjx_refine.view.outline import BATCHES, Arrays, directions, larger, place, support_of, supports
+from mjx_refine.view.outline import Arrays, directions, larger, padded, place, support_of, supports
 from mjx_refine.view.points import point_flow
 
 
@@ -40,14 +40,6 @@ def outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int
 
 
 _outline = jax.jit(outline_function, static_argnums=(0, 2, 3))
-
-
-def _padded(poses: np.ndarray, batch: SceneBatch) -> Arrays:
-    """Poses, sizes and cameras on the device, with rows added up to a size that is compiled."""
-    arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
-    size = next((b for b in BATCHES if b >= len(poses)), -(-len(poses) // BATCHES[-1]) * BATCHES[-1])
-    added = size - len(poses)
-    return tuple(jnp.asarray(np.concatenate([a, np.repeat(a[:1], added, 0)]), jnp.float32) for a in arrays)  # type: ignore[return-value]
 
 
 def changed_moments(
@@ -96,7 +88,7 @@ def outline_view(
     fps: float,
 ) -> OutlineView:
     """The silhouettes of ``poses``, which are ``apparent`` ones, in ``count`` directions."""
-    told = _outline(batch.shapes, _padded(poses, batch), image, count)
+    told = _outline(batch.shapes, padded(poses, batch), image, count)
     reach, contact, facing, scale = (np.asarray(a, np.float64)[: len(poses)] for a in told)
     rate = np.gradient(reach, axis=1) if reach.shape[1] > 1 else np.zeros_like(reach)
     return OutlineView(reach, contact, rate, directions(count), facing, scale, focal_length(batch, image), image, fps)
