@@ -20,9 +20,9 @@ from mjx_refine.sim.stepped import stepped_rollout
 # MuJoCo's default handler appends to MUJOCO_LOG.TXT in the working directory. A candidate that diverges is no news.
 mujoco.set_mju_user_warning(lambda _message: None)
 
-FEW_STEPS = 24
-"""Steps, times candidates, for which waking threads takes longer than they save: that takes some 50 us, a step in the air 2 us
-and one on the floor 20."""
+STEPS_A_THREAD = 64
+"""Steps, times candidates, that are worth one more thread: to wake it takes 25 to 50 us, a step in the air 2 us and one on the
+floor 20."""
 
 
 class MujocoSimulator:
@@ -50,7 +50,9 @@ class MujocoSimulator:
 
     def _workers_for(self, steps: int) -> rollout.Rollout:
         """Threads for so many steps of single candidates; this one alone for few."""
-        threads = self.threads if self.threads > 1 and steps >= FEW_STEPS else 0
+        worth = min(self.threads, steps // STEPS_A_THREAD)
+        # A power of two, or all: few pools serve all calls.
+        threads = 0 if worth < 2 else worth if worth == self.threads else 1 << (worth.bit_length() - 1)
         if threads not in self._workers:
             self._workers[threads] = rollout.Rollout(nthread=threads)
         return self._workers[threads]
