@@ -15,6 +15,9 @@ from mjx_refine.effects.kind import EffectKind, FitView, Start
 MOST_ROWS = 96
 """Candidates predicted at a time."""
 
+AWAY = (-2.0, -1.0, 1.0, 2.0)
+"""Prior widths of an effect's parameters at which fits begin that the linear look would not."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Lead:
@@ -27,6 +30,7 @@ class Lead:
       gain: of evidence, by the linear look.
       step: of the varied parameters, in their own units.
       shift: of the base parameters that goes with it.
+      whole: whether the fit begins with the whole step, and not with as much of it as serves.
     """
 
     name: str
@@ -35,6 +39,7 @@ class Lead:
     gain: float
     step: Float[np.ndarray, "columns"]
     shift: Float[np.ndarray, "dimension"]
+    whole: bool = False
 
     def term(self, frames: int) -> Term:
         """The hypothesis' term."""
@@ -80,6 +85,35 @@ class Screen:
         rows = [(self.fit, self.view, self.scale, self.poses, *family) for family in families]
         found = [lead for leads in self.clip.crew.each(self.clip, _family, rows) for lead in leads]
         return sorted(found, key=lambda lead: -lead.gain)
+
+    def away(self, names: list[str]) -> list[Lead]:
+        """For every effect that ordinary parameters imitate, and every target, the most promising start with much of it, the
+        most promising of these first.
+
+        They imitate it by what else its derivative is made of, and a fit that has bent them so stays there; from much of the
+        effect it does not.
+        """
+        targets = range(len(self.view.batch.shapes))
+        kinds = [catalogue()[name] for name in names if catalogue()[name].imitated]
+        rows = [
+            (self.fit, self.view, self.scale, self.poses, k.name, t)
+            for k in kinds
+            for t in (targets if k.targeted else (-1,))
+        ]
+        return sorted(self.clip.crew.each(self.clip, _far, rows), key=lambda lead: -lead.gain)
+
+    def far(self, kind: EffectKind, target: int) -> Lead:
+        """The most promising of some widths of every parameter of one effect and target."""
+        still = kind.still(self.view, target)
+        width = kind.widths(self.view, target)
+        steps = np.array([a * float(width[k]) * np.eye(len(still.values))[k] for k, _ in still.columns for a in AWAY])
+        white = self.predicted(
+            kind, target, [dataclasses.replace(still, values=still.values + s, columns=()) for s in steps]
+        )
+        told = [self._finite(row) for row in white]
+        best = max(range(len(told)), key=lambda k: told[k][0])
+        (gain, shift), step = told[best], steps[best]
+        return Lead(kind.name, target, still, gain, step[[k for k, _ in still.columns]], shift, whole=True)
 
     def looked(self, kind: EffectKind, target: int, starts: list[Start]) -> list[Lead]:
         """The best few of some starts of one effect and target."""
@@ -159,6 +193,10 @@ def _family(
     kind = catalogue()[name]
     starts = kind.starts(view, target)
     return Screen(clip, fit, view, scale, poses).looked(kind, target, starts) if starts else []
+
+
+def _far(clip: ClipFit, fit: Fit, view: FitView, scale: float, poses: np.ndarray, name: str, target: int) -> Lead:
+    return Screen(clip, fit, view, scale, poses).far(catalogue()[name], target)
 
 
 def distinct(leads: list[Lead], most: int = 3) -> list[Lead]:

@@ -146,8 +146,11 @@ def _singles(
         rows = [(base, lead) for lead in chosen]
         if again == 0:
             # The base model's fit has bent its parameters towards the effect; from the given scene the way is straight.
-            given = Screen(clip, zero, view_of(clip, zero, observation, masks_of), FORGIVING).leads(names)
+            looked = Screen(clip, zero, view_of(clip, zero, observation, masks_of), FORGIVING)
+            given = looked.leads(names)
             rows += [(zero, lead) for lead in chosen_of(given, FRESH, 1)]
+            rows += [(base, lead) for lead in Screen(clip, base, view).away(names)]
+            rows += [(zero, lead) for lead in chosen_of(looked.away(names), FRESH)]
         lines = [f"{lead.name} {target_name(scene.names, lead.target)}".strip() for _, lead in rows]
         for (_, lead), fit in zip(rows, clip.crew.each(clip, _fit_lead, rows, told, lines), strict=True):
             _keep(fitted, (lead.name, lead.target), fit, lead.gain)
@@ -203,7 +206,7 @@ def _fit_lead(clip: ClipFit, here: Fit, lead: Lead) -> Fit:
     if not here.z.any():
         z = clip.fit(hypothesis, z, 7, scale=FORGIVING).z
     fit = clip.fit(hypothesis, z, 9)
-    if fit.cost > here.cost and here.z.any():
+    if fit.cost > here.cost and here.z.any() and not lead.whole:
         # Where the linear look misleads, the effect grows from nothing.
         fit = clip.fit(hypothesis, np.concatenate([here.z, 0 * lead.z(one)]), 9)
     return knocked(clip, fit)
@@ -213,7 +216,8 @@ def _begin(clip: ClipFit, hypothesis: Hypothesis, base: Fit, lead: Lead, z: np.n
     """Where the fit starts: a part of the way that the linear look points, base parameters and effect together."""
     parts = (0.0, 0.1, 0.3, 0.6, 1.0) if lead.start.columns else (0.0, 0.3, 1.0)
     limited = np.clip(lead.shift, -10.0, 10.0)
-    return clip.best_of(hypothesis, np.array([np.concatenate([base.z + a * limited, a * z]) for a in parts]))
+    points = [np.concatenate([base.z + a * limited, z if lead.whole else a * z]) for a in parts]
+    return clip.best_of(hypothesis, np.array(points))
 
 
 def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: Fitted, walled: list[Fit], view: FitView, told: Told) -> None:

@@ -15,6 +15,7 @@ class CameraRoll(EffectKind):
     sentence = "the camera is rolled about its optical axis"
     experiment = "Film a plumb line: it shows the roll; a ball at rest that stays so says that the floor is level."
     channel = "camera"
+    imitated = True
     parameters = (EffectParameter("angle", "degree", 4.0, -180.0, 180.0),)
 
     def camera(self, frames: int, fps: float, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

@@ -176,6 +176,7 @@ class EffectKind:
       physical: whether it acts in the rollout (otherwise in how the rollout is seen).
       strikes: whether it acts as impacts with something unseen, whose impulse nobody knows well.
       drawn: whether it changes outlines (``outline``) or the picture (``warp``).
+      imitated: whether ordinary parameters can imitate much of it, so that its fit begins with much of it as well.
       parameters: its numbers.
     """
 
@@ -187,6 +188,7 @@ class EffectKind:
     physical: ClassVar[bool] = False
     strikes: ClassVar[bool] = False
     drawn: ClassVar[bool] = False
+    imitated: ClassVar[bool] = False
     parameters: ClassVar[tuple[EffectParameter, ...]]
 
     # --- in the rollout -------------------------------------------------------------------------------------------

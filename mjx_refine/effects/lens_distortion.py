@@ -15,6 +15,7 @@ class LensDistortion(EffectKind):
     experiment = "Film a chessboard that fills the view."
     channel = "camera"
     drawn = True
+    imitated = True
     parameters = (EffectParameter("k1", "1", 0.15, -1.0, 3.0),)
 
     def warp(self, points: np.ndarray, focal: np.ndarray, image: tuple[int, int], values: np.ndarray):

@@ -16,6 +16,7 @@ class Magnus(EffectKind):
     experiment = "Film {target} with the opposite spin: a Magnus force bends the path the other way."
     targeted = True
     physical = True
+    imitated = True
     parameters = (EffectParameter("coefficient", "kg", 0.05, -1e3, 1e3),)
 
     def loads(self, motion: Motion, target: int, values: np.ndarray) -> Loads | None:

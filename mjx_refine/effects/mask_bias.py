@@ -15,6 +15,7 @@ class MaskBias(EffectKind):
     experiment = "Compare a mask with the picture by eye; a true size changes with distance, a bias does not."
     channel = "perception"
     drawn = True
+    imitated = True
     parameters = (EffectParameter("width", "px", 2.0, -100.0, 100.0),)
 
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:

@@ -15,6 +15,7 @@ class RollingShutter(EffectKind):
     experiment = "Film with the camera turned by 90 degrees: the skew turns with it."
     channel = "timing"
     drawn = True
+    imitated = True
     parameters = (EffectParameter("readout", "s", 0.012, -0.2, 0.2),)
 
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:

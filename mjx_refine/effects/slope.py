@@ -17,6 +17,7 @@ class Slope(EffectKind):
         "Put a ball at rest on the floor: on a slope it starts to roll. A body in flight does not feel a slope."
     )
     physical = True
+    imitated = True
     parameters = (EffectParameter("x", "degree", 4.0, -60.0, 60.0), EffectParameter("y", "degree", 4.0, -60.0, 60.0))
 
     def floor(self, values: np.ndarray) -> np.ndarray | None:

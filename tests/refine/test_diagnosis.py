@@ -102,6 +102,24 @@ def test_what_the_background_shows_counts_whatever_effect_leads_a_little(monkeyp
     assert answer(told, [22.0]).kind == "unknown"
 
 
+def test_two_effects_are_beside_each_other_where_one_of_them_moves_the_camera(monkeypatch):
+    monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
+    clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0)
+
+    def fitted(*names):
+        terms = [SimpleNamespace(name=name) for name in names]
+        return SimpleNamespace(
+            fit=SimpleNamespace(data=400.0, hypothesis=SimpleNamespace(terms=terms)), lead=9.0, names=names
+        )
+
+    def beside(*names):
+        found = SimpleNamespace(base=fitted().fit, candidates=(fitted(names[0]),), pairs=(fitted(*names),))
+        return signs(clip, found, 0.0).beside
+
+    assert beside("push", "camera_motion") == beside("camera_shake", "drag") == 1.0
+    assert beside("push", "drag") == beside("camera_shake", "camera_motion") == 0.0
+
+
 SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
 
 
@@ -114,6 +132,14 @@ SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
         ({"lead": 5.0, "whole": 9.0}, "unknown"),
         ({"structure_after": 40.0, "after": 5.0}, "unknown"),
         ({"pair": 200.0}, "pair"),
+        ({"pair": 60.0}, "single"),
+        ({"pair": 60.0, "structure_first": 9.0}, "pair"),
+        ({"pair": 60.0, "structure_first": 2.0}, "single"),
+        ({"pair": 40.0, "structure_first": 9.0}, "single"),
+        ({"pair": 60.0, "beside": 1.0}, "pair"),
+        ({"pair": 200.0, "structure_after": 9.0, "structure_first": 90.0}, "unknown"),
+        ({"after": 5.0}, "unknown"),
+        ({"after": 5.0, "pair": 200.0}, "unknown"),
         ({"closed": 0.05}, "unknown"),
         ({"closed": 0.05, "pair": 200.0}, "unknown"),
         ({"closed": 0.05, "lead": 20.0}, "none"),
