@@ -267,7 +267,8 @@ def ranked(clip: ClipFit, compared: Compared, said: Answer, outside: HeldOut, be
 
     pair = best is not None and len(best.names) > 1
     if pair and best is not None:
-        rows += [row(best, k, said.probability) for k in range(len(best.names))]
+        single = compared.candidates[0].names[0]
+        rows += [row(best, k, said.of_pair(name, single)) for k, name in enumerate(best.names)]
     told = {(r.effect, r.target) for r in rows}
     for candidate, share in zip(compared.candidates, said.shares, strict=True):
         one = row(candidate, 0, chance(said, share, max(said.shares)))

@@ -139,6 +139,8 @@ SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
         ({"pair": 60.0, "beside": 1.0}, "pair"),
         ({"pair": 200.0, "structure_after": 9.0, "structure_first": 90.0}, "unknown"),
         ({"after": 5.0}, "unknown"),
+        ({"structure_after": 3.0, "margin": 900.0}, "single"),
+        ({"structure_after": 3.5, "margin": 900.0}, "unknown"),
         ({"after": 5.0, "pair": 200.0}, "unknown"),
         ({"closed": 0.05}, "unknown"),
         ({"closed": 0.05, "pair": 200.0}, "unknown"),
@@ -151,6 +153,13 @@ def test_the_answer_follows_the_signs(changes, kind):
     assert 0.0 < said.probability < 1.0
     assert sum(said.shares) == pytest.approx(1.0)
     assert said.shares[0] > said.shares[1]
+
+
+def test_of_two_named_effects_the_better_one_is_the_surer():
+    said = answer(dataclasses.replace(SIGNS, pair=200.0), [300.0, 150.0])
+    alone = answer(SIGNS, [300.0, 150.0])
+    assert said.of_pair("drag", "drag") == alone.probability > said.probability
+    assert said.of_pair("push", "drag") == said.probability
 
 
 def test_every_kind_proposes_starts_that_a_fit_can_begin_from():

@@ -125,7 +125,12 @@ def ranked(
         return Ranked(t.name, target, probability, candidate.lead, values, after, closed, sentence)
 
     pair = told.best is not None and len(told.best.names) > 1
-    rows = [row(told.best, k, told.answer.probability) for k in range(2)] if pair and told.best else []
+    single = compared.candidates[0].names[0] if compared.candidates else ""
+    rows = (
+        [row(told.best, k, told.answer.of_pair(told.best.names[k], single)) for k in range(2)]
+        if pair and told.best
+        else []
+    )
     named = {(r.effect, r.target) for r in rows}
     others = []
     for candidate in compared.candidates:
