@@ -86,7 +86,7 @@ def _diagnosed(
     outside = held_out(clip, compared.base, best.fit if best else None)
     found = signs(clip, compared, outside.gain, outside.closed)
     leads = [c.lead for c in compared.candidates]
-    said = answer(found, leads)
+    said = answer(found, leads, video=True)
     told("report")
     return _result(clip, compared, outside, found, said, problem, observation, start.matching, seed, began)
 

@@ -170,8 +170,15 @@ class Answer:
         return max(self.single, self.probability) if name == first else self.probability
 
 
-def answer(told: Signs, leads: list[float]) -> Answer:
-    """The answer from the signs; ``leads`` are the candidates' evidence, the best first."""
+def answer(told: Signs, leads: list[float], video: bool = False) -> Answer:
+    """The answer from the signs.
+
+    Args:
+      told: the signs.
+      leads: the candidates' evidence, the best first.
+      video: whether they are of one video, of whose residuals size and structure are known better than of a tracker's poses,
+        which err smoothly in time by themselves, or of several clips.
+    """
     weights = SHARPNESS * (np.array(leads) - max(leads)) / max(told.after, 0.3) if leads else np.zeros(0)
     shares = tuple(float(w) for w in np.exp(weights) / np.exp(weights).sum()) if leads else ()
     if told.lead < (NAMED if told.structure_before >= QUIET else QUIETLY_NAMED):
@@ -179,22 +186,24 @@ def answer(told: Signs, leads: list[float]) -> Answer:
             return Answer("unknown", RIGHT_UNKNOWN, shares)
         lead = np.log1p(max(told.lead, 0.0) / 5)
         return Answer("none", _logistic(RIGHT_NONE["constant"] + RIGHT_NONE["lead"] * lead), shares)
-    if told.closed < CLOSES or told.after > FAR_OFF:
+    if told.closed < CLOSES or (video and told.after > FAR_OFF):
         return Answer("unknown", RIGHT_UNKNOWN, shares)
     margin = np.log1p(max(told.margin, 0.0) / 20)
     single = _logistic(RIGHT_NAME["constant"] + RIGHT_NAME["margin"] * margin)
-    if _paired(told) and told.structure_after <= ODD:
-        return Answer("pair", RIGHT_PAIR, shares, single)
-    allowed = min(STRANGE * (1 + max(told.margin, 0.0) / CLEAR), STRANGEST)
-    if _paired(told) or told.structure_after > allowed:
+    paired = _paired(told, video)
+    allowed = np.inf if paired else STRANGE * (1 + max(told.margin, 0.0) / CLEAR)
+    if told.structure_after > (min(allowed, STRANGEST) if video else allowed):
         return Answer("unknown", RIGHT_UNKNOWN, shares)
+    if paired:
+        return Answer("pair", RIGHT_PAIR, shares, single)
     return Answer("single", single, shares, single)
 
 
-def _paired(told: Signs) -> bool:
+def _paired(told: Signs, video: bool) -> bool:
     """Whether two effects explain enough more than the best one."""
     cleared = told.structure_first > LEFT_OVER and told.structure_after < CLEARED * told.structure_first
-    return told.pair > PAIRED and (told.pair > PART_PAIRED * told.lead or cleared or bool(told.beside))
+    less = video and (cleared or bool(told.beside))
+    return told.pair > PAIRED and (less or told.pair > PART_PAIRED * told.lead)
 
 
 def _logistic(x: float) -> float:

@@ -148,11 +148,18 @@ SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
     ],
 )
 def test_the_answer_follows_the_signs(changes, kind):
-    said = answer(dataclasses.replace(SIGNS, **changes), [300.0, 150.0])
+    said = answer(dataclasses.replace(SIGNS, **changes), [300.0, 150.0], video=True)
     assert said.kind == kind
     assert 0.0 < said.probability < 1.0
     assert sum(said.shares) == pytest.approx(1.0)
     assert said.shares[0] > said.shares[1]
+
+
+@pytest.mark.parametrize("changes", [{"after": 5.0}, {"structure_after": 3.5, "margin": 900.0}])
+def test_poses_may_err_smoothly_and_more_than_their_noise_says(changes):
+    assert answer(dataclasses.replace(SIGNS, **changes), [300.0, 150.0]).kind == "single"
+    assert answer(dataclasses.replace(SIGNS, **changes, pair=200.0), [300.0, 150.0]).kind == "pair"
+    assert answer(dataclasses.replace(SIGNS, pair=60.0, structure_first=9.0), [300.0, 150.0]).kind == "single"
 
 
 def test_of_two_named_effects_the_better_one_is_the_surer():
