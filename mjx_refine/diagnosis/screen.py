@@ -80,10 +80,7 @@ class Screen:
 
     def leads(self, names: list[str]) -> list[Lead]:
         """The best few starts of every effect and target, most promising first."""
-        targets = range(len(self.view.batch.shapes))
-        families = [(name, t) for name in names for t in (targets if catalogue()[name].targeted else (-1,))]
-        rows = [(self.fit, self.view, self.scale, self.poses, *family) for family in families]
-        found = [lead for leads in self.clip.crew.each(self.clip, _family, rows) for lead in leads]
+        found = [lead for leads in self.clip.crew.each(self.clip, _family, self._rows(names)) for lead in leads]
         return sorted(found, key=lambda lead: -lead.gain)
 
     def away(self, names: list[str]) -> list[Lead]:
@@ -93,14 +90,14 @@ class Screen:
         They imitate it by what else its derivative is made of, and a fit that has bent them so stays there; from much of the
         effect it does not.
         """
+        imitated = [name for name in names if catalogue()[name].imitated]
+        return sorted(self.clip.crew.each(self.clip, _far, self._rows(imitated)), key=lambda lead: -lead.gain)
+
+    def _rows(self, names: list[str]) -> list[tuple]:
+        """What a process needs to look ahead, for every effect and target."""
         targets = range(len(self.view.batch.shapes))
-        kinds = [catalogue()[name] for name in names if catalogue()[name].imitated]
-        rows = [
-            (self.fit, self.view, self.scale, self.poses, k.name, t)
-            for k in kinds
-            for t in (targets if k.targeted else (-1,))
-        ]
-        return sorted(self.clip.crew.each(self.clip, _far, rows), key=lambda lead: -lead.gain)
+        families = [(name, t) for name in names for t in (targets if catalogue()[name].targeted else (-1,))]
+        return [(self.fit, self.view, self.scale, self.poses, *family) for family in families]
 
     def far(self, kind: EffectKind, target: int) -> Lead:
         """The most promising of some widths of every parameter of one effect and target."""
@@ -112,8 +109,8 @@ class Screen:
         )
         told = [self._finite(row) for row in white]
         best = max(range(len(told)), key=lambda k: told[k][0])
-        (gain, shift), step = told[best], steps[best]
-        return Lead(kind.name, target, still, gain, step[[k for k, _ in still.columns]], shift, whole=True)
+        gain, shift = told[best]
+        return Lead(kind.name, target, still, gain, steps[best][[k for k, _ in still.columns]], shift, whole=True)
 
     def looked(self, kind: EffectKind, target: int, starts: list[Start]) -> list[Lead]:
         """The best few of some starts of one effect and target."""

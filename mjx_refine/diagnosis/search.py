@@ -142,14 +142,15 @@ def _singles(
     for again in range(2):
         told("looking ahead")
         view = view_of(clip, base, observation, masks_of)
-        chosen = chosen_of(Screen(clip, base, view).leads(names), FAMILIES if again == 0 else 3)
+        ahead = Screen(clip, base, view)
+        chosen = chosen_of(ahead.leads(names), FAMILIES if again == 0 else 3)
         rows = [(base, lead) for lead in chosen]
         if again == 0:
             # The base model's fit has bent its parameters towards the effect; from the given scene the way is straight.
             looked = Screen(clip, zero, view_of(clip, zero, observation, masks_of), FORGIVING)
             given = looked.leads(names)
             rows += [(zero, lead) for lead in chosen_of(given, FRESH, 1)]
-            rows += [(base, lead) for lead in Screen(clip, base, view).away(names)]
+            rows += [(base, lead) for lead in ahead.away(names)]
             rows += [(zero, lead) for lead in chosen_of(looked.away(names), FRESH)]
         lines = [f"{lead.name} {target_name(scene.names, lead.target)}".strip() for _, lead in rows]
         for (_, lead), fit in zip(rows, clip.crew.each(clip, _fit_lead, rows, told, lines), strict=True):

@@ -124,13 +124,9 @@ def ranked(
         values = _values(clips, candidate.fit, k)
         return Ranked(t.name, target, probability, candidate.lead, values, after, closed, sentence)
 
-    pair = told.best is not None and len(told.best.names) > 1
-    single = compared.candidates[0].names[0] if compared.candidates else ""
-    rows = (
-        [row(told.best, k, told.answer.of_pair(told.best.names[k], single)) for k in range(2)]
-        if pair and told.best
-        else []
-    )
+    single = standing[0].names[0] if standing else ""
+    pair = told.best if told.best is not None and len(told.best.names) > 1 else None
+    rows = [row(pair, k, told.answer.of_pair(name, single)) for k, name in enumerate(pair.names)] if pair else []
     named = {(r.effect, r.target) for r in rows}
     others = []
     for candidate in compared.candidates:
