@@ -15,7 +15,7 @@ from mjx_refine.diagnosis.fitted import Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, settled
-from mjx_refine.diagnosis.pace import DAMPINGS, STEPS, Pace, damped, updated
+from mjx_refine.diagnosis.pace import STEPS, descended
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.roam import GENERATIONS, ROAMED, Strategy
 from mjx_refine.diagnosis.settled import Loose, Settled
@@ -31,10 +31,6 @@ SCALE = 5.0
 
 PATIENCE = Parts(1.0, 1.0, 6.0, 1.0)
 """The same for each kind of measurement, in multiples: a centroid is either of the whole mask or not measured at all."""
-
-WORTH, LITTLE_GAIN = 0.3, 0.002
-"""A step by derivatives that were only updated is followed by another where it gains this part of the step before, and this
-part of the cost."""
 
 
 class ClipFit:
@@ -292,37 +288,22 @@ class ClipFit:
 
     # --- least squares --------------------------------------------------------------------------------------------
     @remembered
-    def fit(self, hypothesis: Hypothesis, z: np.ndarray, iterations: int = 12, keep=None, scale: float = SCALE) -> Fit:
-        """Levenberg-Marquardt from ``z``."""
-        low, high = hypothesis.bounds
-        z = np.clip(z, low, high)
-        base, costs = self.residuals(hypothesis, z[None], keep, scale)
-        base, cost = base[0], float(costs[0])
-        pace = Pace()
-        jacobian, fresh, usual = self.jacobian(hypothesis, z, base, keep, scale, pace.size), True, 0.0
-        while iterations > 0:
-            price, slope = prior(hypothesis, z)
-            gradient = jacobian.T @ base + slope * price
-            curvature = jacobian.T @ jacobian + np.diag(slope**2)
-            trials = np.array([damped(z, gradient, curvature, f, low, high) for f in DAMPINGS * pace.damping])
-            moved, costs = self.residuals(hypothesis, trials, keep, scale)
-            best = int(np.argmin(costs))
-            gain = cost - float(costs[best])
-            step, change = trials[best] - z, moved[best] - base
-            if gain > 0:
-                z, base, cost = trials[best], moved[best], float(costs[best])
-            worth = gain >= max(WORTH * usual, LITTLE_GAIN * cost, 0.05)
-            if fresh or worth:
-                iterations -= 1
-                if pace.done(gain, best, cost):
-                    break
-            if worth and pace.failed == 0:
-                jacobian, fresh, usual = updated(jacobian, step, change), False, gain
-            elif gain > 0 or pace.failed or not fresh:
-                jacobian, fresh, usual = self.jacobian(hypothesis, z, base, keep, scale, pace.size), True, 0.0
-        if pace.size != STEPS[0] or not fresh:
-            jacobian = self.jacobian(hypothesis, z, base, keep, scale)
-        return self._finished(hypothesis, z, base, jacobian, keep)
+    def fit(
+        self, hypothesis: Hypothesis, z: np.ndarray, iterations: int = 12, keep=None, scale: float = SCALE, rival=np.inf
+    ) -> Fit:
+        """Levenberg-Marquardt from ``z``; given up where it stays far behind ``rival``, another hypothesis' cost."""
+
+        def residuals(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return self.residuals(hypothesis, points, keep, scale)
+
+        def jacobian(z: np.ndarray, base: np.ndarray, size: float) -> np.ndarray:
+            return self.jacobian(hypothesis, z, base, keep, scale, size)
+
+        start = np.clip(z, *hypothesis.bounds)
+        ended = descended(
+            start, residuals, jacobian, functools.partial(prior, hypothesis), hypothesis.bounds, iterations, rival
+        )
+        return self._finished(hypothesis, *ended, keep)
 
     def best_of(self, hypothesis: Hypothesis, points: Float[np.ndarray, "points dimension"], keep=None) -> np.ndarray:
         """The point with the least cost."""

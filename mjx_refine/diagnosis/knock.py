@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.pace import FAR_BEHIND
 from mjx_refine.diagnosis.slack import Impact, spins
 
 BLOW = 0.25
@@ -20,23 +21,30 @@ BLOW = 0.25
 ROUNDS, ITERATIONS = 2, 8
 """How often the impact is looked for again where least squares ended, and of least squares."""
 
+HOPE, LITTLE = 2.0, 20.0
+"""Multiple of a rival's cost above which a fit is left as it is; gain in evidence below which the impact is not looked for
+again."""
+
 MOVED = 1e-4
 """Distance from the path without the effect from which on the impact has been [m]."""
 
 
-def knocked(clip: ClipFit, fit: Fit) -> Fit:
-    """The fit once its impacts with unseen things may err; the same where it has none."""
+def knocked(clip: ClipFit, fit: Fit, rival: float = np.inf) -> Fit:
+    """The fit once its impacts with unseen things may err; the same where it has none, or costs far more than ``rival``."""
     for _ in range(ROUNDS):
+        if fit.cost > HOPE * rival + FAR_BEHIND:
+            break
         terms = tuple(
             dataclasses.replace(t, excused=excuses(clip, fit, k)) if t.kind.strikes else t
             for k, t in enumerate(fit.hypothesis.terms)
         )
         if all(t.excused is None for t in terms):
             break
-        trial = clip.fit(dataclasses.replace(fit.hypothesis, terms=terms), fit.z, ITERATIONS)
-        if trial.evidence <= fit.evidence:
+        trial = clip.fit(dataclasses.replace(fit.hypothesis, terms=terms), fit.z, ITERATIONS, rival=rival)
+        gain = trial.evidence - fit.evidence
+        fit = trial if gain > 0 else fit
+        if gain < LITTLE:
             break
-        fit = trial
     return fit
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
 
@@ -10,6 +13,15 @@ STEPS = (0.002, 0.02, 0.2)
 are tried where it leads no further."""
 
 DAMPINGS = np.array([0.03, 0.3, 1.0, 10.0, 100.0])
+
+WORTH, LITTLE_GAIN = 0.3, 0.002
+"""A step by derivatives that were only updated is followed by another where it gains this part of the step before, and this
+part of the cost."""
+
+ATTEMPTS, BEHIND, FAR_BEHIND = 4, 1.3, 30.0
+"""After so many steps a fit is given up whose cost is more than this multiple of its rival's, and this more on top. In ten
+clips of the withheld exams with seeds 6 and 8 no fit within 10 of the base model's evidence at its end was above 1.23 times the
+base model's cost after four steps (of 150), and 274 of 419 that ended 30 or more behind were above the bound."""
 
 
 def damped(
@@ -66,3 +78,61 @@ class Pace:
         self.damping = min(300.0 * self.damping, 1e3) if shorter else 1.0
         self.size = self.size if shorter else STEPS[(STEPS.index(self.size) + 1) % len(STEPS)]
         return False
+
+
+def behind(attempts: int, cost: float, rival: float) -> bool:
+    """Whether a fit is so far behind another hypothesis' cost, after so many steps, that it will not catch up."""
+    return attempts >= ATTEMPTS and cost > BEHIND * rival + FAR_BEHIND
+
+
+def descended(
+    z: Float[np.ndarray, "dimension"],
+    residuals: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    jacobian: Callable[[np.ndarray, np.ndarray, float], np.ndarray],
+    prior: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    bounds: tuple[np.ndarray, np.ndarray],
+    iterations: int,
+    rival: float = np.inf,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where least squares leads from ``z``: (point, residuals there, derivatives).
+
+    Args:
+      z: where to begin, within the bounds.
+      residuals: of points, one a row, with the costs that hold the prior as well.
+      jacobian: at a point with its residuals, by differences of some size (``STEPS``).
+      prior: of a point: residuals of the prior, and their slopes.
+      bounds: of the coordinates.
+      iterations: steps that were worth one, or were taken with derivatives made for them.
+      rival: cost of another hypothesis; what stays far behind it is given up, with the derivatives that it has.
+    """
+    base, costs = residuals(z[None])
+    base, cost = base[0], float(costs[0])
+    pace = Pace()
+    slopes, fresh, usual = jacobian(z, base, pace.size), True, 0.0
+    for attempt in itertools.count(1):
+        if iterations <= 0:
+            break
+        price, slope = prior(z)
+        gradient = slopes.T @ base + slope * price
+        curvature = slopes.T @ slopes + np.diag(slope**2)
+        trials = np.array([damped(z, gradient, curvature, f, *bounds) for f in DAMPINGS * pace.damping])
+        moved, costs = residuals(trials)
+        best = int(np.argmin(costs))
+        gain = cost - float(costs[best])
+        step, change = trials[best] - z, moved[best] - base
+        if gain > 0:
+            z, base, cost = trials[best], moved[best], float(costs[best])
+        worth = gain >= max(WORTH * usual, LITTLE_GAIN * cost, 0.05)
+        if fresh or worth:
+            iterations -= 1
+            if pace.done(gain, best, cost):
+                break
+        if behind(attempt, cost, rival):
+            return z, base, slopes
+        if worth and pace.failed == 0:
+            slopes, fresh, usual = updated(slopes, step, change), False, gain
+        elif gain > 0 or pace.failed or not fresh:
+            slopes, fresh, usual = jacobian(z, base, pace.size), True, 0.0
+    if pace.size != STEPS[0] or not fresh:
+        slopes = jacobian(z, base, STEPS[0])
+    return z, base, slopes

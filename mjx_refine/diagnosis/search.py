@@ -152,8 +152,9 @@ def _singles(
             rows += [(zero, lead) for lead in chosen_of(given, FRESH, 1)]
             rows += [(base, lead) for lead in ahead.away(names)]
             rows += [(zero, lead) for lead in chosen_of(looked.away(names), FRESH)]
-        lines = [f"{lead.name} {target_name(scene.names, lead.target)}".strip() for _, lead in rows]
-        for (_, lead), fit in zip(rows, clip.crew.each(clip, _fit_lead, rows, told, lines), strict=True):
+        rows = [(here, lead, base.cost) for here, lead in rows]
+        lines = [f"{lead.name} {target_name(scene.names, lead.target)}".strip() for _, lead, _ in rows]
+        for (_, lead, _), fit in zip(rows, clip.crew.each(clip, _fit_lead, rows, told, lines), strict=True):
             _keep(fitted, (lead.name, lead.target), fit, lead.gain)
         if "hidden_obstacle" in names:
             _walls_from_pushes(clip, base, fitted, walled, view, told)
@@ -199,18 +200,18 @@ def chosen_of(leads: list[Lead], families: int, starts: int = 2) -> list[Lead]:
     return [lead for family in best for lead in family]
 
 
-def _fit_lead(clip: ClipFit, here: Fit, lead: Lead) -> Fit:
-    """Fits a lead from where it was seen."""
+def _fit_lead(clip: ClipFit, here: Fit, lead: Lead, rival: float) -> Fit:
+    """Fits a lead from where it was seen; ``rival``: what the base model costs."""
     one = lead.term(clip.frames)
     hypothesis = here.hypothesis.added(one)
     z = _begin(clip, hypothesis, here, lead, lead.z(one))
     if not here.z.any():
         z = clip.fit(hypothesis, z, 7, scale=FORGIVING).z
-    fit = clip.fit(hypothesis, z, 9)
+    fit = clip.fit(hypothesis, z, 9, rival=rival)
     if fit.cost > here.cost and here.z.any() and not lead.whole:
         # Where the linear look misleads, the effect grows from nothing.
-        fit = clip.fit(hypothesis, np.concatenate([here.z, 0 * lead.z(one)]), 9)
-    return knocked(clip, fit)
+        fit = clip.fit(hypothesis, np.concatenate([here.z, 0 * lead.z(one)]), 9, rival=rival)
+    return knocked(clip, fit, rival)
 
 
 def _begin(clip: ClipFit, hypothesis: Hypothesis, base: Fit, lead: Lead, z: np.ndarray) -> np.ndarray:
@@ -226,7 +227,8 @@ def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: Fitted, walled: list[Fi
     pushes = [(target, *found) for (name, target), found in fitted.items() if name == "push"]
     pushes = [row for row in pushes if row[1].evidence >= base.evidence + 3.0 and not any(row[1] is w for w in walled)]
     walled += [fit for _, fit, _ in pushes]
-    walls = walls_from_pushes(clip, [(fit, view) for _, fit, _ in pushes], told, ["hidden_obstacle"] * len(pushes))
+    rows = [(fit, view, base.cost) for _, fit, _ in pushes]
+    walls = walls_from_pushes(clip, rows, told, ["hidden_obstacle"] * len(pushes))
     for (target, _, promise), wall in zip(pushes, walls, strict=True):
         if wall is not None:
             _keep(fitted, ("hidden_obstacle", target), wall, promise)
@@ -249,13 +251,13 @@ def _pairs(
     fits = clip.crew.each(clip, _second, [(first.fit, lead) for first, _, lead in beside], told, lines)
     found = [Candidate(fit, _lead(fit, base), lead.gain) for fit, (_, _, lead) in zip(fits, beside, strict=True)]
     pushed = [
-        (one, view)
+        (one, view, first.fit.cost)
         for one, (first, view, lead) in zip(found, beside, strict=True)
         if lead.name == "push" and "hidden_obstacle" in names and one.lead > first.lead
     ]
-    lines = [f"{one.names[0]} and hidden_obstacle" for one, _ in pushed]
-    walls = walls_from_pushes(clip, [(one.fit, view) for one, view in pushed], told, lines)
-    for wall, (one, _) in zip(walls, pushed, strict=True):
+    lines = [f"{one.names[0]} and hidden_obstacle" for one, _, _ in pushed]
+    walls = walls_from_pushes(clip, [(one.fit, view, rival) for one, view, rival in pushed], told, lines)
+    for wall, (one, *_) in zip(walls, pushed, strict=True):
         if wall is not None:
             found.append(Candidate(wall, _lead(wall, base), one.promise))
     found.sort(key=lambda c: -c.lead)
@@ -269,7 +271,8 @@ def _second(clip: ClipFit, first: Fit, lead: Lead) -> Fit:
     """The fit with one more effect."""
     one = lead.term(clip.frames)
     hypothesis = first.hypothesis.added(one)
-    return knocked(clip, clip.fit(hypothesis, _begin(clip, hypothesis, first, lead, lead.z(one)), 7))
+    fit = clip.fit(hypothesis, _begin(clip, hypothesis, first, lead, lead.z(one)), 7, rival=first.cost)
+    return knocked(clip, fit, first.cost)
 
 
 def _again(

@@ -21,20 +21,24 @@ of these they begin, beside the one that is not turned."""
 ITERATIONS = 9
 """Of least squares from each."""
 
+PATIENCE = 1.5
+"""Multiplies what an obstacle may cost before its fit is given up: its impact may not err yet, which explains more."""
+
 
 def walls_from_pushes(
-    clip: ClipFit, pushes: Sequence[tuple[Fit, FitView]], told: Callable[[str], None], lines: Sequence[str]
+    clip: ClipFit, pushes: Sequence[tuple[Fit, FitView, float]], told: Callable[[str], None], lines: Sequence[str]
 ) -> list[Fit | None]:
     """For each fit, whose last effect is a push, the best with an obstacle in its place; None where its rollout diverged.
 
     Args:
       clip: residuals.
-      pushes: the fits, and what is seen of the clip.
+      pushes: the fits, what is seen of the clip, and what the hypothesis without the push costs.
       told: called with the line of a fit that is looked at.
       lines: one a fit.
     """
-    begun = clip.crew.each(clip, _facings, pushes, told, lines)
-    fits = iter(clip.crew.each(clip, _wall, [row for rows in begun for row in rows]))
+    begun = clip.crew.each(clip, _facings, [(fit, view) for fit, view, _ in pushes], told, lines)
+    rows = [(*row, rival) for rows, (_, _, rival) in zip(begun, pushes, strict=True) for row in rows]
+    fits = iter(clip.crew.each(clip, _wall, rows))
     return [max((next(fits) for _ in rows), key=lambda wall: wall.evidence, default=None) for rows in begun]
 
 
@@ -60,5 +64,5 @@ def _facings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis, n
     return [(hypothesis, points[k * len(moments) + int(np.argmin(costs[k]))]) for k in sorted(facing)]
 
 
-def _wall(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray) -> Fit:
-    return knocked(clip, clip.fit(hypothesis, z, ITERATIONS))
+def _wall(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray, rival: float) -> Fit:
+    return knocked(clip, clip.fit(hypothesis, z, ITERATIONS, rival=PATIENCE * rival), rival)

@@ -21,6 +21,9 @@ class Wind(EffectKind):
         force[..., :2] = values[:, None] * mean_shadow(motion.batch)[..., None]
         return force, np.zeros_like(force)
 
+    def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
+        return np.inf
+
     def widths(self, view: FitView, target: int) -> np.ndarray:
         # A metre per second squared or two on the object that feels it most.
         return np.full(2, 1.5 * float((view.batch.mass / mean_shadow(view.batch)).min()))

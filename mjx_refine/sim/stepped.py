@@ -52,7 +52,11 @@ def stepped_rollout(
         motion = _motion(state, batch, k * step, step, world)
         idle = acting.idle(batch, motion)
         steps = 1 if np.isnan(idle) else int(np.clip(min(idle, 1e3) // step, 1, last - k))
-        told = _about_the_mass(acting.loads(batch, motion), motion, centre)
+        told = acting.loads(batch, motion)
+        if centre is not None and told is not None:
+            told = _about_the_mass(told, motion, centre)
+            # A force that stays as it is turns a body that rotates about a mass elsewhere ever differently.
+            steps = 1 if told[0].any() else steps
         applied[:] = 0.0
         if told is not None:
             for part, load in enumerate(told):
@@ -89,10 +93,8 @@ def stepped_rollout(
     return result
 
 
-def _about_the_mass(told: Loads | None, motion: Motion, centre: np.ndarray | None) -> Loads | None:
+def _about_the_mass(told: Loads, motion: Motion, centre: np.ndarray) -> Loads:
     """Loads about the centres of mass, where MuJoCo applies them, from those about the bodies' centres."""
-    if told is None or centre is None:
-        return told
     force, torque = told
     return force, torque - rotations.cross(rotations.rotate(motion.quaternion, centre), force)
 

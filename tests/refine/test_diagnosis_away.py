@@ -54,7 +54,7 @@ def test_such_a_fit_begins_with_all_of_the_step_and_finds_the_effect(rolled):
     assert z[-1] == lead.z(one)[0] != 0.0
     some = dataclasses.replace(lead, step=1e-3 * lead.step, whole=False)
     assert abs(_begin(clip, hypothesis, base, some, some.z(one))[-1]) < abs(z[-1])
-    fit = _fit_lead(clip, base, lead)
+    fit = _fit_lead(clip, base, lead, base.cost)
     assert fit.evidence > base.evidence + 30
     assert fit.hypothesis.values(fit.z[None], 0)[0, 0] == pytest.approx(ANGLE, abs=1.5)
 

@@ -10,7 +10,7 @@ from mjx_refine.diagnosis.crew import Crew
 from mjx_refine.diagnosis.exchange import exchanged
 from mjx_refine.diagnosis.fitted import Fit
 from mjx_refine.diagnosis.measure import Parts
-from mjx_refine.diagnosis.pace import damped, updated
+from mjx_refine.diagnosis.pace import ATTEMPTS, STEPS, damped, descended, updated
 from mjx_refine.diagnosis.roam import Strategy
 
 RNG = np.random.default_rng(0)
@@ -36,6 +36,58 @@ def test_an_undamped_step_ends_at_the_bottom_and_within_the_bounds():
     narrow = damped(np.zeros(3), gradient, curvature, 1e-9, -np.full(3, 10.0), np.full(3, 1.5))
     assert np.allclose(wide, target, atol=1e-5)
     assert np.allclose(narrow, [0.5, -1.0, 1.5], atol=1e-5)
+
+
+class Curved:
+    """Residuals of a narrow curved valley (Rosenbrock 1960), counted, with a prior of no weight."""
+
+    def __init__(self):
+        self.rows = self.slopes = 0
+
+    def residuals(self, points):
+        self.rows += len(points)
+        x, y = points.T
+        white = np.stack([10 * (y - x**2), 1 - x, np.full(len(x), 3.0)], 1)
+        return white, 0.5 * (white**2).sum(1)
+
+    def jacobian(self, z, base, size):
+        self.slopes += 1
+        assert np.array_equal(base, self.residuals(z[None])[0][0])
+        assert size in STEPS
+        return np.array([[-20 * z[0], 10.0], [-1.0, 0.0], [0.0, 0.0]])
+
+    def descended(self, iterations, rival=np.inf):
+        wide = np.full(2, 1e3)
+        nothing = np.zeros(2)
+        return descended(
+            np.array([-1.2, 1.0]),
+            self.residuals,
+            self.jacobian,
+            lambda z: (nothing, nothing),
+            (-wide, wide),
+            iterations,
+            rival,
+        )
+
+
+def test_least_squares_follow_a_valley_to_its_end_with_derivatives_of_where_they_ended():
+    z, base, slopes = Curved().descended(100)
+    assert 0.5 * base @ base < 4.5 + 0.05
+    assert np.allclose(base, [10 * (z[1] - z[0] ** 2), 1 - z[0], 3.0])
+    # A last step that gained next to nothing is not worth others.
+    assert np.allclose(slopes, [[-20 * z[0], 10.0], [-1.0, 0.0], [0.0, 0.0]], atol=0.3)
+
+
+def test_what_stays_far_behind_a_rival_is_given_up_and_what_is_near_is_not():
+    whole, near, far = Curved(), Curved(), Curved()
+    z = whole.descended(100)[0]
+    assert np.array_equal(near.descended(100, rival=4.5)[0], z)
+    assert near.rows == whole.rows
+    # The constant alone costs 4.5, and 30 more than any rival are always allowed.
+    given_up = far.descended(100, rival=-1e3)[0]
+    assert far.rows < whole.rows
+    assert far.slopes <= ATTEMPTS
+    assert not np.allclose(given_up, 1.0, atol=1e-2)
 
 
 def _ended(seed: int, jag: float) -> float:

@@ -199,7 +199,12 @@ IDLING = (
     effect("push", "ball", time=0.31, x=1.0, z=0.5),
     effect("hidden_obstacle", "ball", angle=180.0, distance=-0.9, restitution=0.6),
     effect("friction_patch", x=0.5, y=0.0, radius=0.3, friction=0.05),
+    effect("wind", x=60.0, y=20.0),
 )
+
+
+def single_steps(monkeypatch) -> None:
+    monkeypatch.setattr(acting, "idle", lambda batch, motion: 0.0)
 
 
 @pytest.mark.parametrize("entry", IDLING, ids=lambda e: e.effect)
@@ -207,9 +212,20 @@ def test_steps_taken_together_end_where_single_ones_do(entry, monkeypatch):
     ball = dataclasses.replace(BALL, position=(0.0, 0.0, 0.2))
     state = {"gravity": GRAVITY, "body": ball, "linear_velocity": (1.6, 0.0, 0.0), "angular_velocity": (0.0, 2.0, 0.0)}
     together = rolled_out(entry, **state)
-    monkeypatch.setattr(acting, "idle", lambda batch, motion: 0.0)
+    single_steps(monkeypatch)
     np.testing.assert_allclose(together, rolled_out(entry, **state), atol=1e-4)
     assert np.abs(together - rolled_out(**state)).max() > 0.05
+
+
+def test_a_steady_force_beside_the_centre_of_mass_is_looked_at_in_every_step(monkeypatch):
+    ball = dataclasses.replace(BALL, position=(0.0, 0.0, 2.0))
+    entries = effect("wind", x=60.0, y=20.0), effect("offset_com", "ball", x=0.04, y=0.0, z=0.02)
+    state = {"gravity": GRAVITY, "body": ball, "angular_velocity": (0.0, 9.0, 0.0)}
+    together = rolled_out(*entries, **state)
+    single_steps(monkeypatch)
+    np.testing.assert_allclose(together, rolled_out(*entries, **state), atol=1e-6)
+    # A force at the mass itself would not turn the ball.
+    assert np.abs(together - rolled_out(entries[1], **state))[..., 3:].max() > 0.05
 
 
 SIZES = {"sphere": (0.15,), "box": (0.1, 0.15, 0.2), "cylinder": (0.12, 0.2)}
