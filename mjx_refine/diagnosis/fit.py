@@ -15,7 +15,7 @@ from mjx_refine.diagnosis.fitted import Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, settled
-from mjx_refine.diagnosis.pace import STEPS, descended
+from mjx_refine.diagnosis.pace import STEPS, Standing, descended
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.roam import GENERATIONS, ROAMED, Strategy
 from mjx_refine.diagnosis.settled import Loose, Settled
@@ -289,21 +289,39 @@ class ClipFit:
     # --- least squares --------------------------------------------------------------------------------------------
     @remembered
     def fit(
-        self, hypothesis: Hypothesis, z: np.ndarray, iterations: int = 12, keep=None, scale: float = SCALE, rival=np.inf
+        self,
+        hypothesis: Hypothesis,
+        z: np.ndarray,
+        iterations: int = 12,
+        keep=None,
+        scale: float = SCALE,
+        rival: float = np.inf,
+        attempts: int | None = None,
     ) -> Fit:
-        """Levenberg-Marquardt from ``z``; given up where it stays far behind ``rival``, another hypothesis' cost."""
+        """Levenberg-Marquardt from ``z``.
 
-        def residuals(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            return self.residuals(hypothesis, points, keep, scale)
+        Given up where it stays far behind ``rival``, another hypothesis' cost; interrupted after so many ``attempts``.
+        """
+        return self._descended(hypothesis, np.clip(z, *hypothesis.bounds), iterations, keep, scale, rival, attempts)
 
-        def jacobian(z: np.ndarray, base: np.ndarray, size: float) -> np.ndarray:
-            return self.jacobian(hypothesis, z, base, keep, scale, size)
+    @remembered
+    def gone_on(self, fit: Fit, iterations: int, rival: float = np.inf) -> Fit:
+        """Levenberg-Marquardt from where it was interrupted, of a fit to all frames."""
+        start = Standing(fit.z, fit.residual, fit.cost, fit.jacobian)
+        return self._descended(fit.hypothesis, start, iterations, None, SCALE, rival, None)
 
-        start = np.clip(z, *hypothesis.bounds)
+    def _descended(self, hypothesis: Hypothesis, start, iterations: int, keep, scale: float, rival, attempts) -> Fit:
         ended = descended(
-            start, residuals, jacobian, functools.partial(prior, hypothesis), hypothesis.bounds, iterations, rival
+            start,
+            lambda points: self.residuals(hypothesis, points, keep, scale),
+            lambda z, base, size: self.jacobian(hypothesis, z, base, keep, scale, size),
+            functools.partial(prior, hypothesis),
+            hypothesis.bounds,
+            iterations,
+            rival,
+            attempts,
         )
-        return self._finished(hypothesis, *ended, keep)
+        return self._finished(hypothesis, ended.z, ended.base, ended.slopes, keep, ended.ended)
 
     def best_of(self, hypothesis: Hypothesis, points: Float[np.ndarray, "points dimension"], keep=None) -> np.ndarray:
         """The point with the least cost."""
@@ -359,7 +377,7 @@ class ClipFit:
                 fit = trial if trial.cost < fit.cost else fit
         return fit
 
-    def _finished(self, hypothesis: Hypothesis, z, base, jacobian, keep=None) -> Fit:
+    def _finished(self, hypothesis: Hypothesis, z, base, jacobian, keep=None, ended: bool = True) -> Fit:
         data = 0.5 * float(base @ base)
         price_of_z, slope = prior(hypothesis, z)
         cost = data + 0.5 * float(price_of_z @ price_of_z)
@@ -367,7 +385,7 @@ class ClipFit:
         price = sum(np.log(t.places) for t in hypothesis.terms)
         if hypothesis.excused is not None and (slack := self._slack(keep, hypothesis.excused)) is not None:
             price += slack.price - self._slack(keep, None).price  # type: ignore[union-attr]
-        return Fit(hypothesis, z, cost, data, jacobian, base, -cost - 0.5 * logdet - price)
+        return Fit(hypothesis, z, cost, data, jacobian, base, -cost - 0.5 * logdet - price, ended)
 
     def at(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE) -> Fit:
         """No step, just what holds at ``z``."""

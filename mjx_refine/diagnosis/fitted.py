@@ -24,6 +24,7 @@ class Fit:
       jacobian: of the residuals.
       residual: at the point, in noise widths times the root of their weight.
       evidence: logarithm of the hypothesis' probability, up to a constant of the clip (Laplace; MacKay 2003, ch. 28).
+      ended: whether least squares ended by themselves; if not, they were interrupted or given up, and ``jacobian`` is rough.
     """
 
     hypothesis: Hypothesis
@@ -33,6 +34,7 @@ class Fit:
     jacobian: Float[np.ndarray, "residuals dimension"]
     residual: Float[np.ndarray, "residuals"]
     evidence: float
+    ended: bool = True
 
     @property
     def gradient(self) -> Float[np.ndarray, "dimension"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -85,30 +86,53 @@ def behind(attempts: int, cost: float, rival: float) -> bool:
     return attempts >= ATTEMPTS and cost > BEHIND * rival + FAR_BEHIND
 
 
+class Standing(NamedTuple):
+    """Where least squares stand.
+
+    Attributes:
+      z: the point.
+      base: residuals there.
+      cost: half their sum of squares, with the prior.
+      slopes: derivatives, there or nearby.
+      ended: whether no further step was worth one; if not, they were interrupted or given up.
+    """
+
+    z: Float[np.ndarray, "dimension"]
+    base: Float[np.ndarray, "residuals"]
+    cost: float
+    slopes: Float[np.ndarray, "residuals dimension"]
+    ended: bool = True
+
+
 def descended(
-    z: Float[np.ndarray, "dimension"],
+    start: Float[np.ndarray, "dimension"] | Standing,
     residuals: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
     jacobian: Callable[[np.ndarray, np.ndarray, float], np.ndarray],
     prior: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
     bounds: tuple[np.ndarray, np.ndarray],
     iterations: int,
     rival: float = np.inf,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where least squares leads from ``z``: (point, residuals there, derivatives).
+    attempts: int | None = None,
+) -> Standing:
+    """Where least squares lead.
 
     Args:
-      z: where to begin, within the bounds.
+      start: a point within the bounds, or where they were interrupted.
       residuals: of points, one a row, with the costs that hold the prior as well.
       jacobian: at a point with its residuals, by differences of some size (``STEPS``).
       prior: of a point: residuals of the prior, and their slopes.
       bounds: of the coordinates.
       iterations: steps that were worth one, or were taken with derivatives made for them.
-      rival: cost of another hypothesis; what stays far behind it is given up, with the derivatives that it has.
+      rival: cost of another hypothesis; what stays far behind it is given up.
+      attempts: steps after which they are interrupted, whatever they were worth; never by default.
     """
-    base, costs = residuals(z[None])
-    base, cost = base[0], float(costs[0])
-    pace = Pace()
-    slopes, fresh, usual = jacobian(z, base, pace.size), True, 0.0
+    pace, usual = Pace(), 0.0
+    if isinstance(start, Standing):
+        (z, base, cost, slopes, _), fresh = start, False
+    else:
+        z, (rows, costs) = start, residuals(start[None])
+        base, cost = rows[0], float(costs[0])
+        slopes, fresh = jacobian(z, base, pace.size), True
     for attempt in itertools.count(1):
         if iterations <= 0:
             break
@@ -127,12 +151,12 @@ def descended(
             iterations -= 1
             if pace.done(gain, best, cost):
                 break
-        if behind(attempt, cost, rival):
-            return z, base, slopes
+        if behind(attempt, cost, rival) or attempt == attempts:
+            return Standing(z, base, cost, updated(slopes, step, change) if gain > 0 else slopes, False)
         if worth and pace.failed == 0:
             slopes, fresh, usual = updated(slopes, step, change), False, gain
         elif gain > 0 or pace.failed or not fresh:
             slopes, fresh, usual = jacobian(z, base, pace.size), True, 0.0
     if pace.size != STEPS[0] or not fresh:
         slopes = jacobian(z, base, STEPS[0])
-    return z, base, slopes
+    return Standing(z, base, cost, slopes)

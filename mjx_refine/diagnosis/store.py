@@ -137,7 +137,7 @@ def _tokens(part: object) -> Iterable[bytes]:
 
 # --- fits -------------------------------------------------------------------------------------------------------------
 
-_KEPT = ("z", "cost", "data", "jacobian", "residual", "evidence")
+_KEPT = ("z", "cost", "data", "jacobian", "residual", "evidence", "ended")
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
@@ -148,8 +148,8 @@ def packed(fit: Fit, suffix: str) -> Arrays:
 
 def unpacked(hypothesis: Hypothesis, arrays: Arrays, suffix: str) -> Fit:
     """The fit again."""
-    z, cost, data, jacobian, residual, evidence = (arrays[name + suffix] for name in _KEPT)
-    return Fit(hypothesis, z, float(cost), float(data), jacobian, residual, float(evidence))
+    z, cost, data, jacobian, residual, evidence, ended = (arrays[name + suffix] for name in _KEPT)
+    return Fit(hypothesis, z, float(cost), float(data), jacobian, residual, float(evidence), bool(ended))
 
 
 def remembered(method: Method) -> Method:

@@ -13,7 +13,7 @@ from mjx_refine.diagnosis.diagnose import prepared
 from mjx_refine.diagnosis.fit import ClipFit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.screen import AWAY, Screen
-from mjx_refine.diagnosis.search import _begin, _fit_lead, view_of
+from mjx_refine.diagnosis.search import _begin, _fit_leads, view_of
 from mjx_refine.effects import catalogue
 from mjx_refine.scene import Effect
 
@@ -54,7 +54,7 @@ def test_such_a_fit_begins_with_all_of_the_step_and_finds_the_effect(rolled):
     assert z[-1] == lead.z(one)[0] != 0.0
     some = dataclasses.replace(lead, step=1e-3 * lead.step, whole=False)
     assert abs(_begin(clip, hypothesis, base, some, some.z(one))[-1]) < abs(z[-1])
-    fit = _fit_lead(clip, base, lead, base.cost)
+    [fit] = _fit_leads(clip, [(base, lead)], base.cost, base.cost, str, [lead.name])
     assert fit.evidence > base.evidence + 30
     assert fit.hypothesis.values(fit.z[None], 0)[0, 0] == pytest.approx(ANGLE, abs=1.5)
 

@@ -4,6 +4,7 @@ import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from mjx_refine.diagnosis.chaos import DRAWS, EXCUSED, believed, drawn, jaggedness
 from mjx_refine.diagnosis.crew import Crew
@@ -56,22 +57,25 @@ class Curved:
         assert size in STEPS
         return np.array([[-20 * z[0], 10.0], [-1.0, 0.0], [0.0, 0.0]])
 
-    def descended(self, iterations, rival=np.inf):
+    def descended(self, iterations, rival=np.inf, attempts=None, start=None):
         wide = np.full(2, 1e3)
         nothing = np.zeros(2)
         return descended(
-            np.array([-1.2, 1.0]),
+            np.array([-1.2, 1.0]) if start is None else start,
             self.residuals,
             self.jacobian,
             lambda z: (nothing, nothing),
             (-wide, wide),
             iterations,
             rival,
+            attempts,
         )
 
 
 def test_least_squares_follow_a_valley_to_its_end_with_derivatives_of_where_they_ended():
-    z, base, slopes = Curved().descended(100)
+    z, base, cost, slopes, ended = Curved().descended(100)
+    assert ended
+    assert cost == pytest.approx(0.5 * base @ base)
     assert 0.5 * base @ base < 4.5 + 0.05
     assert np.allclose(base, [10 * (z[1] - z[0] ** 2), 1 - z[0], 3.0])
     # A last step that gained next to nothing is not worth others.
@@ -80,14 +84,30 @@ def test_least_squares_follow_a_valley_to_its_end_with_derivatives_of_where_they
 
 def test_what_stays_far_behind_a_rival_is_given_up_and_what_is_near_is_not():
     whole, near, far = Curved(), Curved(), Curved()
-    z = whole.descended(100)[0]
-    assert np.array_equal(near.descended(100, rival=4.5)[0], z)
+    z = whole.descended(100).z
+    assert np.array_equal(near.descended(100, rival=4.5).z, z)
     assert near.rows == whole.rows
     # The constant alone costs 4.5, and 30 more than any rival are always allowed.
-    given_up = far.descended(100, rival=-1e3)[0]
+    given_up = far.descended(100, rival=-1e3)
+    assert not given_up.ended
     assert far.rows < whole.rows
     assert far.slopes <= ATTEMPTS
-    assert not np.allclose(given_up, 1.0, atol=1e-2)
+    assert not np.allclose(given_up.z, 1.0, atol=1e-2)
+
+
+def test_what_was_interrupted_goes_on_from_its_derivatives():
+    curved = Curved()
+    part = curved.descended(100, attempts=3)
+    assert not part.ended
+    made, rows = curved.slopes, curved.rows
+    first = curved.descended(1, start=part)
+    assert first.cost < part.cost
+    # One look for the trial steps; the derivatives are made anew once, where it ends.
+    assert curved.slopes == made + 1
+    assert curved.rows == rows + 5 + 1
+    whole = curved.descended(100, start=part)
+    assert whole.ended
+    assert whole.cost < 4.5 + 0.05
 
 
 def _ended(seed: int, jag: float) -> float:
