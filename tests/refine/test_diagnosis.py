@@ -15,7 +15,7 @@ from mjx_refine.diagnosis.fitted import prior
 from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.slack import impacts, slack_of, spins
-from mjx_refine.diagnosis.verdict import Answer, Signs, answer, signs
+from mjx_refine.diagnosis.verdict import LIKELY, UNLIKELY, Answer, Signs, answer, signs
 from mjx_refine.effects import batch_with_effects, catalogue
 from mjx_refine.effects.acting import apparent
 from mjx_refine.errors import InputError
@@ -160,6 +160,25 @@ def test_poses_may_err_smoothly_and_more_than_their_noise_says(changes):
     assert answer(dataclasses.replace(SIGNS, **changes), [300.0, 150.0]).kind == "single"
     assert answer(dataclasses.replace(SIGNS, **changes, pair=200.0), [300.0, 150.0]).kind == "pair"
     assert answer(dataclasses.replace(SIGNS, pair=60.0, structure_first=9.0), [300.0, 150.0]).kind == "single"
+
+
+@pytest.mark.parametrize(
+    ("changes", "likely"),
+    [
+        ({}, True),
+        ({"pair": 12.0}, True),
+        ({"pair": 30.0}, False),
+        ({"pair": 30.0, "margin": 900.0}, True),
+        ({"pair": 12.0, "margin": 10.0}, False),
+        ({"pair": 200.0}, False),
+        ({"after": 5.0}, True),
+        ({"lead": 20.0, "held_out": 0.0}, True),
+        ({"lead": 20.0, "held_out": 9.0}, False),
+    ],
+)
+def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, likely):
+    said = answer(dataclasses.replace(SIGNS, **changes), [300.0, 150.0], video=True)
+    assert said.probability == (LIKELY if likely else UNLIKELY)
 
 
 def test_of_two_named_effects_the_better_one_is_the_surer():

@@ -12,7 +12,7 @@ from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.heldout import Outside
 from mjx_refine.diagnosis.joint.search import JointCandidate, JointCompared
 from mjx_refine.diagnosis.result import Ranked, Value, Verdict
-from mjx_refine.diagnosis.verdict import LITTLE, NAMED, RIGHT_UNKNOWN, Answer, Signs, answer, structure
+from mjx_refine.diagnosis.verdict import LIKELY, LITTLE, NAMED, Answer, Signs, answer, structure
 
 JUDGED = 3
 """Single effects that are judged on held-out clips, the best evidence first."""
@@ -69,7 +69,7 @@ def said(
     told = answer(found, [c.lead for c in kept.candidates])
     if told.kind == "none" and outside[0][1].inexplicable:
         # What the fit excuses, by bending the starts, does not foretell the other clips.
-        told = Answer("unknown", RIGHT_UNKNOWN, told.shares)
+        told = Answer("unknown", LIKELY, told.shares)
     names, shapes = compared.base.hypothesis.space.scene.names, compared.base.hypothesis.space.scene.shapes
     verdict, best = verdict_of(kept, told, names, shapes)  # type: ignore[arg-type]
     sentence = verdict.sentence.replace("This clip cannot", "These clips cannot").replace("the clip to", "the clips to")
