@@ -175,16 +175,6 @@ def _by_name(compared: Compared, said: Answer) -> dict[str, float]:
     return result
 
 
-def chance(said: Answer, share: float, first: float) -> float:
-    """Probability of one effect of the catalogue: the named one's is the answer's, the others' are less in proportion to their
-    shares, and together not more than what is left."""
-    if said.kind == "single":
-        if share == first:
-            return said.probability
-        return min(said.probability * share / first, (1 - said.probability) * share / max(1 - first, 1e-9))
-    return (1 - said.probability) * share
-
-
 def _result(
     clip, compared, outside: HeldOut, found: Signs, said: Answer, problem, observation, matching, seed, began
 ) -> Diagnosis:
@@ -271,7 +261,7 @@ def ranked(clip: ClipFit, compared: Compared, said: Answer, outside: HeldOut, be
         rows += [row(best, k, said.of_pair(name, single)) for k, name in enumerate(best.names)]
     told = {(r.effect, r.target) for r in rows}
     for candidate, share in zip(compared.candidates, said.shares, strict=True):
-        one = row(candidate, 0, chance(said, share, max(said.shares)))
+        one = row(candidate, 0, said.of(share))
         if (one.effect, one.target) not in told:
             rows.append(one)
     return (

@@ -10,7 +10,6 @@ import pytest
 from own_clip import CAMERA, SIZE
 
 from mjx_refine.diagnosis import diagnose, verdict
-from mjx_refine.diagnosis.diagnose import chance
 from mjx_refine.diagnosis.fitted import prior
 from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
@@ -184,8 +183,21 @@ def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, li
 def test_of_two_named_effects_the_better_one_is_the_surer():
     said = answer(dataclasses.replace(SIGNS, pair=200.0), [300.0, 150.0])
     alone = answer(SIGNS, [300.0, 150.0])
-    assert said.of_pair("drag", "drag") == alone.probability > said.probability
+    assert alone.at_work > said.of_pair("drag", "drag") == said.at_work > said.probability
     assert said.of_pair("push", "drag") == said.probability
+
+
+def test_an_effect_that_is_not_named_is_hardly_at_work():
+    named, silent = (
+        answer(SIGNS, [300.0, 150.0]),
+        answer(dataclasses.replace(SIGNS, lead=20.0, held_out=0.0), [20.0, 9.0]),
+    )
+    perhaps, strange = (
+        answer(dataclasses.replace(SIGNS, **changes), [20.0, 9.0]) for changes in ({"lead": 20.0}, {"closed": 0.0})
+    )
+    assert named.at_work > named.probability
+    assert [silent.kind, perhaps.kind, strange.kind] == ["none", "none", "unknown"]
+    assert silent.at_work < strange.at_work < perhaps.at_work < 0.25
 
 
 def test_every_kind_proposes_starts_that_a_fit_can_begin_from():
@@ -248,11 +260,11 @@ def test_drag_is_named_and_measured():
     assert sum(p.share for p in found.where) <= 1.0
 
 
-@pytest.mark.parametrize("probability", [0.3, 0.9])
-def test_what_is_named_is_likelier_than_what_is_not(probability):
+@pytest.mark.parametrize("at_work", [0.3, 0.9])
+def test_what_leads_is_likelier_at_work_than_what_does_not(at_work):
     shares = (0.6, 0.3, 0.1)
-    said = Answer("single", probability, shares)
-    told = [chance(said, share, shares[0]) for share in shares]
-    assert told[0] == probability
+    said = Answer("single", 0.25, shares, at_work)
+    told = [said.of(share) for share in shares]
+    assert told[0] == at_work
     assert told == sorted(told, reverse=True)
     assert sum(told) <= 1.0 + 1e-9

@@ -7,12 +7,12 @@ import math
 
 import numpy as np
 
-from mjx_refine.diagnosis.diagnose import chance, values_of, verdict_of
+from mjx_refine.diagnosis.diagnose import values_of, verdict_of
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.heldout import Outside
 from mjx_refine.diagnosis.joint.search import JointCandidate, JointCompared
 from mjx_refine.diagnosis.result import Ranked, Value, Verdict
-from mjx_refine.diagnosis.verdict import LIKELY, LITTLE, NAMED, Answer, Signs, answer, structure
+from mjx_refine.diagnosis.verdict import AT_WORK, LIKELY, LITTLE, NAMED, Answer, Signs, answer, structure
 
 JUDGED = 3
 """Single effects that are judged on held-out clips, the best evidence first."""
@@ -69,7 +69,7 @@ def said(
     told = answer(found, [c.lead for c in kept.candidates])
     if told.kind == "none" and outside[0][1].inexplicable:
         # What the fit excuses, by bending the starts, does not foretell the other clips.
-        told = Answer("unknown", LIKELY, told.shares)
+        told = Answer("unknown", LIKELY, told.shares, AT_WORK["unknown"])
     names, shapes = compared.base.hypothesis.space.scene.names, compared.base.hypothesis.space.scene.shapes
     verdict, best = verdict_of(kept, told, names, shapes)  # type: ignore[arg-type]
     sentence = verdict.sentence.replace("This clip cannot", "These clips cannot").replace("the clip to", "the clips to")
@@ -113,7 +113,6 @@ def ranked(
     judged = {id(c): o for c, o in outside}
     standing = [c for c in compared.candidates if id(c) in judged and not any(c is r for r in told.refuted)]
     shares = dict(zip(map(id, standing), told.answer.shares, strict=False))
-    top = max(told.answer.shares, default=1.0)
 
     def row(candidate: JointCandidate, k: int, probability: float) -> Ranked:
         t = candidate.fit.hypothesis.terms[k]
@@ -131,7 +130,7 @@ def ranked(
     others = []
     for candidate in compared.candidates:
         share = shares.get(id(candidate))
-        one = row(candidate, 0, 0.0 if share is None else chance(told.answer, share, top))
+        one = row(candidate, 0, 0.0 if share is None else told.answer.of(share))
         if (one.effect, one.target) not in named:
             others.append(one)
     return (*rows, *sorted(others, key=lambda r: (-r.probability, -r.evidence)))

@@ -13,7 +13,7 @@ from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.joint.arrow import Arrow
 from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis, with_frozen_setup
-from mjx_refine.diagnosis.pace import DAMPINGS, STEPS, Pace
+from mjx_refine.diagnosis.pace import DAMPINGS, STEPS, Pace, behind
 from mjx_refine.diagnosis.store import Arrays, fingerprint, packed, remembered, unpacked
 from mjx_refine.effects import acting
 
@@ -183,7 +183,13 @@ class Clips:
     # --- least squares --------------------------------------------------------------------------------------------
     @remembered
     def fit(
-        self, hypothesis: JointHypothesis, z: np.ndarray, iterations: int = 12, keeps: Keeps = None, scale=SCALE
+        self,
+        hypothesis: JointHypothesis,
+        z: np.ndarray,
+        iterations: int = 12,
+        keeps: Keeps = None,
+        scale=SCALE,
+        rival: float = np.inf,
     ) -> JointFit:
         """Levenberg-Marquardt from ``z``, as ``ClipFit.fit``."""
         low, high = hypothesis.bounds
@@ -192,7 +198,7 @@ class Clips:
         base, cost = [row[0] for row in rows], float(costs[0])
         pace = Pace()
         fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale))
-        for _ in range(iterations):
+        for attempt in range(1, iterations + 1):
             gradient, curvature = fit.gradient, fit.curvature
             trials = np.array([_step(z, gradient, curvature, f, low, high) for f in DAMPINGS * pace.damping])
             rows, costs = self.residuals(hypothesis, trials, keeps, scale)
@@ -200,7 +206,7 @@ class Clips:
             gain = cost - float(costs[best])
             if gain > 0:
                 z, base, cost = trials[best], [row[best] for row in rows], float(costs[best])
-            if pace.done(gain, best, cost):
+            if pace.done(gain, best, cost) or behind(attempt, cost, rival):
                 break
             fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale, pace.size))
         if pace.size != STEPS[0] or fit.z is not z:

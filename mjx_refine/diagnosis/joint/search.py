@@ -126,13 +126,13 @@ def _singles(
         told("looking ahead")
         for lead in chosen_of(_look(clips, base, seen, names), FAMILIES if again == 0 else 2):
             told(f"{lead.name} {target_name(seen.names, lead.target)}".strip())
-            _fit_lead(clips, base, lead, fitted)
+            _fit_lead(clips, base, lead, base.cost, fitted)
         if again == 0:
             # The base model's fit has bent its parameters towards the effect; from the given scenes the way is straight.
             given = clips.at(base.hypothesis, 0 * base.z, scale=FORGIVING)
             for lead in chosen_of(_look(clips, given, seen, names, FORGIVING), FRESH, 1):
                 told(f"{lead.name} {target_name(seen.names, lead.target)}, from the given scenes".strip())
-                _fit_lead(clips, given, lead, fitted)
+                _fit_lead(clips, given, lead, base.cost, fitted)
         best = max(fitted.values(), key=lambda fit: fit.evidence, default=base)
         if not fitted:
             break
@@ -157,18 +157,18 @@ def _lead(fit: JointFit, base: JointFit) -> float:
     return fit.evidence - base.evidence - sum(DOUBT.get(t.name, 0.0) for t in fit.hypothesis.terms)
 
 
-def _fit_lead(clips: Clips, here: JointFit, lead: Lead, fitted: dict) -> None:
-    """Fits a lead from where it was seen, and keeps it where it is the family's best."""
+def _fit_lead(clips: Clips, here: JointFit, lead: Lead, rival: float, fitted: dict) -> None:
+    """Fits a lead from where it was seen, and keeps it where it is the family's best; ``rival``: what the base model costs."""
     one = lead.term(clips.frames)
     hypothesis = here.hypothesis.added(one)
     z = _begin(clips, hypothesis, here, lead, lead.z(one))
     given = not here.z.any()
     if given:
         z = clips.fit(hypothesis, z, 7, scale=FORGIVING).z
-    fit = clips.fit(hypothesis, z, 9)
+    fit = clips.fit(hypothesis, z, 9, rival=rival)
     if fit.cost > here.cost and not given:
         # Where the linear look misleads, the effect grows from nothing.
-        fit = clips.fit(hypothesis, hypothesis.grown(here.z, 0 * lead.z(one)), 9)
+        fit = clips.fit(hypothesis, hypothesis.grown(here.z, 0 * lead.z(one)), 9, rival=rival)
     key = (lead.name, lead.target)
     if key not in fitted or fit.evidence > fitted[key].evidence:
         fitted[key] = fit
