@@ -20,7 +20,7 @@ from mjx_refine.search.features import DIRECTIONS
 from mjx_refine.view.moments import whole_function
 from mjx_refine.view.outline import Arrays, directions, padded, place, support_of
 from mjx_refine.view.points import point_flow_function
-from mjx_refine.view.seen import changed_moments, outline_function
+from mjx_refine.view.seen import MANY, changed_moments, directions_for, outline_function
 
 SIZES = (8, 48)
 """Batch sizes that are compiled: a line search, and the derivatives of two objects with an effect. More are cut up."""
@@ -58,8 +58,9 @@ def _plain_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int,
 
 
 @functools.partial(jax.jit, static_argnums=(0, 3, 4))
-def _predict(shapes, arrays, pixels, image, drawn: bool):
-    told = outline_function(shapes, arrays, image, DIRECTIONS) if drawn else (_plain_function(shapes, arrays, image),)
+def _predict(shapes, arrays, pixels, image, count: int):
+    """``count``: directions in which effects change outlines; 0 where none does."""
+    told = outline_function(shapes, arrays, image, count) if count else (_plain_function(shapes, arrays, image),)
     return told, whole_function(shapes, arrays, image), point_flow_function(shapes, arrays, pixels, image)
 
 
@@ -89,41 +90,39 @@ class Predictor:
         bad = np.logical_not(np.isfinite(poses).all((1, 2, 3)))
         poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
         seen = acting.apparent(poses, batch, self.fps)
-        drawn = acting.changes_outlines(batch)
-        told, whole, flow = self._predicted(seen, batch, drawn)
+        count = directions_for(batch, DIRECTIONS) if acting.changes_outlines(batch) else 0
+        told, whole, flow = self._predicted(seen, batch, count)
         flow = flow[:, :-1]
         reach = told[0]
-        if drawn:
+        if count:
             focal = (self.image[1] / 2) / np.tan(batch.camera_fovy / 2)
             rate = np.gradient(reach, axis=1) if reach.shape[1] > 1 else np.zeros_like(reach)
-            view = OutlineView(
-                reach, told[1], rate, directions(DIRECTIONS), told[2], told[3], focal, self.image, self.fps
-            )
+            view = OutlineView(reach, told[1], rate, directions(count), told[2], told[3], focal, self.image, self.fps)
             change = acting.outline_change(batch, view)
-            reach = reach + change
+            reach = (reach + change)[..., :: count // DIRECTIONS]
             whole = changed_moments(whole, batch, view, change)
             flow = self._seen_flow(flow, batch, focal)
         return Prediction(reach, flow, whole, self._background(batch, len(poses), poses.shape[1]), bad)
 
-    def _predicted(self, seen: np.ndarray, batch: SceneBatch, drawn: bool):
+    def _predicted(self, seen: np.ndarray, batch: SceneBatch, count: int):
         """``_predict`` of rows by batches of ``SIZES``."""
         pixels, found = jnp.asarray(self.pixels, jnp.float32), []
         for first in range(0, len(seen), SIZES[-1]):
             rows = slice(first, min(first + SIZES[-1], len(seen)))
             device = padded(seen[rows], batch[rows], SIZES)
             # What follows is prepared while this is computed.
-            found.append((rows.stop - first, _predict(self.shapes, device, pixels, self.image, drawn)))
+            found.append((rows.stop - first, _predict(self.shapes, device, pixels, self.image, count)))
         parts = [jax.tree.map(lambda a, n=n: np.asarray(a, np.float64)[:n], one) for n, one in found]
         return parts[0] if len(parts) == 1 else jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
     def warm(self, frames: int) -> None:
         """Compiles predictions of clips of so many frames."""
         count, pixels = len(self.shapes), jnp.asarray(self.pixels, jnp.float32)
-        for drawn, size in itertools.product((True, False), SIZES):
+        for directed, size in itertools.product((DIRECTIONS, 0, MANY), SIZES):
             poses = np.tile([0.0, 2.0, 0.5, 1.0, 0.0, 0.0, 0.0], (size, frames, count, 1))
             place, angle = np.tile([0.0, -2.0, 4.0], (size, 1)), np.ones(size)
             arrays = (poses, np.full((size, count, 3), 0.3), place, angle, angle)
-            _predict(self.shapes, tuple(jnp.asarray(a, jnp.float32) for a in arrays), pixels, self.image, drawn)
+            _predict(self.shapes, tuple(jnp.asarray(a, jnp.float32) for a in arrays), pixels, self.image, directed)
 
     def _seen_flow(self, flow: np.ndarray, batch: SceneBatch, focal: np.ndarray) -> np.ndarray:
         here = np.broadcast_to(self.pixels[None, :-1], flow.shape)

@@ -235,6 +235,11 @@ def changes_outlines(batch: SceneBatch) -> bool:
     return any(kind.drawn for kind, _ in _acting(batch))
 
 
+def shrinks_outlines(batch: SceneBatch) -> bool:
+    """Whether an effect takes so much off corners of outlines that its change needs many directions."""
+    return any(kind.shrinks(effect.values) for kind, effect in _acting(batch))
+
+
 def outline_change(batch: SceneBatch, view: OutlineView) -> Float[np.ndarray, "batch frames objects directions"]:
     """What the effects add to the support functions [px]; NaN where nothing is seen any more."""
     total = np.zeros(view.reach.shape)

@@ -221,6 +221,10 @@ class EffectKind:
         """The camera's turn in its own axes (right, up, back), (batch, frames, 3, 3), and its travel [m]."""
         return None
 
+    def shrinks(self, values: np.ndarray) -> bool:
+        """Whether ``outline`` takes so much off corners that it needs many directions."""
+        return False
+
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         """What is added to the support functions [px], broadcast to (batch, frames, objects, directions)."""
         return None

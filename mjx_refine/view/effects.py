@@ -16,8 +16,10 @@ from scipy import ndimage
 from mjx_refine.batch import BatchEffect, SceneBatch
 from mjx_refine.effects import acting
 from mjx_refine.effects.kind import EffectKind
+from mjx_refine.effects.mask_bias import width_change
 from mjx_refine.effects.registry import kind_of
 from mjx_refine.view.exposure import poses_at, straightened
+from mjx_refine.view.outline import supports
 from mjx_refine.view.picture import draw
 from mjx_refine.view.rows import Rows, cast_rows
 from mjx_refine.view.seen import focal_length, outline_view, rolls
@@ -178,12 +180,13 @@ def _world(poses: np.ndarray, batch: SceneBatch, image, fps: float, told: Layers
     ground = np.zeros((len(batch), poses.shape[1], 1, 7))
     ground[..., 3:] = turn
     seen = acting.apparent(np.concatenate([poses, ground], 2), batch, fps)
-    change = None
+    bodies, change = seen[:, :, :-1], None
     if told.outlined:
-        view = outline_view(seen[:, :, :-1], batch, image, DIRECTIONS, fps)
+        view = outline_view(bodies, batch, image, DIRECTIONS, fps)
         change = acting.outline_change(dataclasses.replace(batch, effects=told.outlined), view)
     if widened and told.widening is not None:
-        wide = np.broadcast_to(told.widening[:, None, None, None], (*poses.shape[:3], DIRECTIONS))
+        reach = supports(bodies, batch, image, DIRECTIONS)
+        wide = width_change(reach if change is None else reach + change, told.widening)
         change = wide if change is None else change + wide
     return seen, change
 

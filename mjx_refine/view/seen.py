@@ -16,6 +16,14 @@ from mjx_refine.scene import Shape
 from mjx_refine.view.outline import Arrays, directions, larger, padded, place, support_of, supports
 from mjx_refine.view.points import point_flow
 
+MANY = 128
+"""Directions that tell what is left of corners where outlines shrink."""
+
+
+def directions_for(batch: SceneBatch, count: int) -> int:
+    """How many directions, a multiple of ``count``, the effects of ``batch`` need."""
+    return count * -(-MANY // count) if acting.shrinks_outlines(batch) else count
+
 
 def outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int], count: int):
     """(reach, contact, facing, scale) of every silhouette in ``count`` directions, as ``OutlineView`` has them; pure."""
@@ -51,12 +59,17 @@ def changed_moments(
     """Centroids and equivalent radii [px] of silhouettes that effects change by ``change``, or hide in part.
 
     To first order in the change: the polygon of contact points is moved along its normals, and its own moments' change is
-    added to the exact ones.
+    added to the exact ones. Where directions are many, points move along their tangents as well, as gradients of the
+    changed support function do.
     """
     before = polygon_sums(view.contact)
     hidden = acting.hidden_polygons(batch, view.contact)
     if hidden is None:
-        after = polygon_sums(view.contact + change[..., None] * view.normals)
+        moved = view.contact + change[..., None] * view.normals
+        if change.shape[-1] >= MANY:
+            slope = (np.roll(change, -1, -1) - np.roll(change, 1, -1)) / (4 * np.pi / change.shape[-1])
+            moved = moved + slope[..., None] * np.stack([-view.normals[:, 1], view.normals[:, 0]], -1)
+        after = polygon_sums(moved)
     else:
         after = before - polygon_sums(hidden)
     area = [np.maximum(np.abs(sums[..., 0]), 1e-9) for sums in (before, after)]
@@ -105,8 +118,9 @@ def seen_supports(
     seen = acting.apparent(poses, batch, fps)
     if not acting.changes_outlines(batch):
         return supports(seen, batch, image, count)
-    view = outline_view(seen, batch, image, count, fps)
-    return view.reach + acting.outline_change(batch, view)
+    many = directions_for(batch, count)
+    view = outline_view(seen, batch, image, many, fps)
+    return (view.reach + acting.outline_change(batch, view))[..., :: many // count]
 
 
 def seen_point_flow(

@@ -15,6 +15,7 @@ from scipy import ndimage
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting, batch_with_effects
+from mjx_refine.effects.mask_bias import inner
 from mjx_refine.evaluate import evaluate_scene
 from mjx_refine.scene import Body, Camera, Effect, Samples, Scene
 from mjx_refine.search import Options, refine
@@ -257,6 +258,16 @@ def test_a_biased_mask_of_a_disc(width):
     assert np.abs(flow).max() < 1e-4
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.2, 0.6])
+def test_what_shrinks_keeps_its_corners(turn):
+    angle = 2 * np.pi * np.arange(128) / 128
+    square = np.abs(np.cos(angle - turn)) + np.abs(np.sin(angle - turn))
+    apart = 300 * np.cos(angle) - 40 * np.sin(angle)
+    thin = inner(40.0 * square + apart - 7.0)
+    np.testing.assert_allclose(thin, 33.0 * square + apart, atol=0.35)
+    np.testing.assert_allclose(inner(40.0 + apart - 7.0), 33.0 + apart)
+
+
 def test_fat_masks_grow_over_background_alone():
     pair = (Body("box", "a", (0.3, 0.3, 0.1), (-0.3, 0.0, 1.0)), Body("box", "b", (0.3, 0.3, 0.1), (0.3, 0.0, 1.0)))
     scene = Scene(pair, ABOVE, (0.0, 0.0, 0.0))
@@ -340,6 +351,21 @@ def test_outlines_and_flow_are_those_of_the_pictures(entry):
     pixels[1, 0, 0] = middle + 0.5
     told = seen_point_flow(poses, batch, pixels, SIZE, FPS)[0, 1, 0, 0]
     np.testing.assert_allclose(told, flow[1, middle[1], middle[0]], atol=0.08)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3])
+def test_a_thin_box_is_thin_at_its_corners_as_in_its_picture(turn):
+    box = afloat("box", (0.6, 0.4, 0.2), orientation=(np.cos(turn), 0.0, 0.1, np.sin(turn)))
+    batch = batch_with_effects([dataclasses.replace(box, effects=(effect("mask_bias", width=-6.0),))])
+    poses = MujocoSimulator(batch.shapes, FPS, 1).rollout(batch, 2)
+    masks, _ = draw_effects(poses[0], batch, SIZE, FPS)
+    angle = 2 * np.pi * np.arange(16) / 16
+    rows, columns = np.nonzero(masks[0] == 1)
+    drawn = (np.stack([columns + 0.5, rows + 0.5], -1) @ np.stack([np.cos(angle), np.sin(angle)])).max(0)
+    told = seen_supports(poses, batch, SIZE, 16, FPS)[0, 0, 0]
+    assert np.abs(told - drawn - 0.35).max() < 0.9
+    plain = seen_supports(poses, dataclasses.replace(batch, effects=()), SIZE, 16, FPS)[0, 0, 0]
+    assert (plain - 6.0 - drawn).max() > 1.5
 
 
 QUICK = ("camera_motion", "lens_distortion", "camera_roll")

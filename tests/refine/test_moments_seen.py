@@ -59,11 +59,12 @@ SEEN = (
     effect("lens_distortion", k1=0.25),
     effect("rolling_shutter", readout=0.015),
     effect("mask_bias", width=3.0),
+    effect("mask_bias", width=-5.0),
     effect("occluder", left=170.0, top=60.0, right=200.0, bottom=200.0),
 )
 
 
-@pytest.mark.parametrize("entry", SEEN, ids=lambda e: e.effect)
+@pytest.mark.parametrize("entry", SEEN, ids=lambda e: f"{e.effect} {e.parameters[0][1]:g}")
 def test_centroids_and_areas_are_those_of_the_pictures(entry):
     batch = batch_with_effects([dataclasses.replace(SCENE, effects=(entry,))])
     poses = MujocoSimulator(batch.shapes, FPS, 1).rollout(batch, 4)
