@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
-from mjx_refine.diagnosis.fit import ClipFit
+from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.search import Candidate, Compared
 from mjx_refine.diagnosis.where import misfit_map
 
@@ -214,6 +215,21 @@ def answer(told: Signs, leads: list[float], video: bool = False) -> Answer:
     if told.pair > MORE * np.sqrt(1 + max(told.margin, 0.0) / 20):
         return Answer("single", UNLIKELY, shares, AT_WORK["less"])
     return Answer("single", LIKELY, shares, AT_WORK["likely"])
+
+
+def standing(said: Answer, compared: Compared, closed_of: Callable[[Fit], float]) -> Answer:
+    """The answer, or ``unknown`` where two effects lead, one is named, and that one alone does not close enough of the gap.
+
+    Args:
+      said: the answer.
+      compared: all hypotheses.
+      closed_of: part of the gap on held-out frames that a fit closes.
+    """
+    if said.kind != "single" or best_candidate(compared) is compared.candidates[0]:
+        return said
+    if closed_of(compared.candidates[0].fit) >= CLOSES:
+        return said
+    return Answer("unknown", LIKELY, said.shares, AT_WORK["unknown"])
 
 
 def _paired(told: Signs, video: bool) -> bool:

@@ -14,7 +14,7 @@ from mjx_refine.diagnosis.fitted import prior
 from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.slack import impacts, slack_of, spins
-from mjx_refine.diagnosis.verdict import LIKELY, UNLIKELY, Answer, Signs, answer, signs
+from mjx_refine.diagnosis.verdict import LIKELY, UNLIKELY, Answer, Signs, answer, signs, standing
 from mjx_refine.effects import batch_with_effects, catalogue
 from mjx_refine.effects.acting import apparent
 from mjx_refine.errors import InputError
@@ -178,6 +178,21 @@ def test_poses_may_err_smoothly_and_more_than_their_noise_says(changes):
 def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, likely):
     said = answer(dataclasses.replace(SIGNS, **changes), [300.0, 150.0], video=True)
     assert said.probability == (LIKELY if likely else UNLIKELY)
+
+
+@pytest.mark.parametrize(
+    ("second", "closed", "kind"), [(310.0, 0.05, "unknown"), (310.0, 0.5, "single"), (290.0, 0.05, "single")]
+)
+def test_one_effect_of_two_that_lead_must_close_the_gap_alone(second, closed, kind):
+    one, two = SimpleNamespace(fit="one", lead=300.0), SimpleNamespace(fit="two", lead=second)
+    asked = []
+    said = standing(
+        answer(SIGNS, [300.0, 150.0]),
+        SimpleNamespace(candidates=(one,), pairs=(two,)),
+        lambda fit: asked.append(fit) or closed,
+    )
+    assert said.kind == kind
+    assert asked == (["one"] if second > 300.0 else [])
 
 
 def test_of_two_named_effects_the_better_one_is_the_surer():
