@@ -21,7 +21,7 @@ from mjx_refine.diagnosis.replay import Replay, replays
 from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Value, Verdict
 from mjx_refine.diagnosis.search import Candidate, Compared, compare, view_of
 from mjx_refine.diagnosis.store import Store
-from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, map_of, signs, standing
+from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, map_of, signs, upheld
 from mjx_refine.diagnosis.where import describe, misfit_map, places
 from mjx_refine.errors import InputError
 from mjx_refine.linear_algebra import one_thread
@@ -87,7 +87,7 @@ def _diagnosed(
     found = signs(clip, compared, outside.gain, outside.closed)
     leads = [c.lead for c in compared.candidates]
     said = answer(found, leads, video=True)
-    said = standing(said, compared, lambda fit: held_out(clip, compared.base, fit).closed)
+    said = upheld(said, compared, lambda fit: held_out(clip, compared.base, fit).closed)
     told("report")
     return _result(clip, compared, outside, found, said, problem, observation, start.matching, seed, began)
 

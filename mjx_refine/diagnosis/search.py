@@ -238,6 +238,7 @@ def _strikes(fit: Fit) -> bool:
 
 
 def _begun(clip: ClipFit, here: Fit, lead: Lead, rival: float) -> Fit:
+    """A lead's fit after its first steps."""
     one = lead.term(clip.frames)
     hypothesis = here.hypothesis.added(one)
     z = _begin(clip, hypothesis, here, lead, lead.z(one))
@@ -251,6 +252,7 @@ def _begun(clip: ClipFit, here: Fit, lead: Lead, rival: float) -> Fit:
 
 
 def _ended(clip: ClipFit, fit: Fit, rival: float) -> Fit:
+    """The fit at its end, its impacts with unseen things as they may err."""
     return knocked(clip, fit if fit.ended else clip.gone_on(fit, REST, rival), rival)
 
 

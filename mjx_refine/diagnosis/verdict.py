@@ -217,7 +217,7 @@ def answer(told: Signs, leads: list[float], video: bool = False) -> Answer:
     return Answer("single", LIKELY, shares, AT_WORK["likely"])
 
 
-def standing(said: Answer, compared: Compared, closed_of: Callable[[Fit], float]) -> Answer:
+def upheld(said: Answer, compared: Compared, closed_of: Callable[[Fit], float]) -> Answer:
     """The answer, or ``unknown`` where two effects lead, one is named, and that one alone does not close enough of the gap.
 
     Args:

@@ -14,7 +14,7 @@ from mjx_refine.diagnosis.fitted import prior
 from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.slack import impacts, slack_of, spins
-from mjx_refine.diagnosis.verdict import LIKELY, UNLIKELY, Answer, Signs, answer, signs, standing
+from mjx_refine.diagnosis.verdict import LIKELY, UNLIKELY, Answer, Signs, answer, signs, upheld
 from mjx_refine.effects import batch_with_effects, catalogue
 from mjx_refine.effects.acting import apparent
 from mjx_refine.errors import InputError
@@ -186,7 +186,7 @@ def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, li
 def test_one_effect_of_two_that_lead_must_close_the_gap_alone(second, closed, kind):
     one, two = SimpleNamespace(fit="one", lead=300.0), SimpleNamespace(fit="two", lead=second)
     asked = []
-    said = standing(
+    said = upheld(
         answer(SIGNS, [300.0, 150.0]),
         SimpleNamespace(candidates=(one,), pairs=(two,)),
         lambda fit: asked.append(fit) or closed,

@@ -20,7 +20,7 @@ from mjx_refine.diagnosis.poses.where import describe, misfit_map, seen_frames
 from mjx_refine.diagnosis.result import Diagnosis, Gap, PoseErrors
 from mjx_refine.diagnosis.search import Candidate, Compared, compare, view_of
 from mjx_refine.diagnosis.store import Store
-from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, signs, standing
+from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, signs, upheld
 from mjx_refine.diagnosis.where import places_of
 from mjx_refine.effects import catalogue
 from mjx_refine.errors import InputError
@@ -90,7 +90,7 @@ def diagnose_recording(
     outside = held_out(clip, compared.base, best.fit if best else None)
     found = unsettled(signs(clip, compared, outside[0].gain, outside[0].closed), compared)
     said = answer(found, [c.lead for c in compared.candidates])
-    said = standing(said, compared, lambda fit: held_out(clip, compared.base, fit)[0].closed)
+    said = upheld(said, compared, lambda fit: held_out(clip, compared.base, fit)[0].closed)
     told("report")
     diagnosis = _result(clip, compared, outside, found, said, blank, columns, seed, began)
     return _with_plain(diagnosis, first[0], compared.impacts)
