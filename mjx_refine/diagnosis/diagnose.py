@@ -154,8 +154,10 @@ def verdict_of(compared: Compared, said: Answer, names: tuple[str, ...], shapes)
     best = compared.pairs[0] if said.kind == "pair" else next(c for c in compared.candidates if c.names[0] == top)
     group = [name for name, share in sorted(by_name.items(), key=lambda kv: -kv[1]) if share > TOLD_APART]
     alike = (tuple(group),) if len(group) > 1 and said.kind == "single" else ()
+    # Of two the one that leads more by itself comes first.
+    terms = sorted(best.fit.hypothesis.terms, key=lambda t: t.name != top)
     words = []
-    for t in best.fit.hypothesis.terms:
+    for t in terms:
         name = names[t.target] if t.target >= 0 else ""
         words.append(t.kind.sentence.format(target=name, shape=shapes[t.target] if t.target >= 0 else ""))
     text = "; and ".join(words)
@@ -163,9 +165,9 @@ def verdict_of(compared: Compared, said: Answer, names: tuple[str, ...], shapes)
     text = (text if text.startswith(names) else text[0].upper() + text[1:]) + "."
     if alike:
         text += f" This clip cannot tell {', '.join(alike[0])} apart."
-    first = best.fit.hypothesis.terms[0]
+    first = terms[0]
     experiment = first.kind.experiment.format(target=names[first.target] if first.target >= 0 else "the object")
-    return Verdict(best.names, said.probability, alike, text, experiment), best
+    return Verdict(tuple(t.name for t in terms), said.probability, alike, text, experiment), best
 
 
 def _by_name(compared: Compared, said: Answer) -> dict[str, float]:
@@ -265,11 +267,8 @@ def ranked(clip: ClipFit, compared: Compared, said: Answer, outside: HeldOut, be
         one = row(candidate, 0, said.of(share))
         if (one.effect, one.target) not in told:
             rows.append(one)
-    return (
-        rows[:2] + sorted(rows[2:], key=lambda r: -r.probability)
-        if pair
-        else sorted(rows, key=lambda r: -r.probability)
-    )
+    named = 2 if pair else 0
+    return [*sorted(rows[:named], key=lambda r: -r.probability), *sorted(rows[named:], key=lambda r: -r.probability)]
 
 
 def _rms(clip: ClipFit, fit: Fit) -> float:

@@ -10,6 +10,7 @@ import pytest
 from own_clip import CAMERA, SIZE
 
 from mjx_refine.diagnosis import diagnose, verdict
+from mjx_refine.diagnosis.diagnose import verdict_of
 from mjx_refine.diagnosis.fitted import prior
 from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
@@ -200,6 +201,19 @@ def test_of_two_named_effects_the_better_one_is_the_surer():
     alone = answer(SIGNS, [300.0, 150.0])
     assert alone.at_work > said.of_pair("drag", "drag") == said.at_work > said.probability
     assert said.of_pair("push", "drag") == said.probability
+
+
+def test_of_two_named_effects_the_one_that_leads_by_itself_comes_first():
+    def candidate(*names):
+        terms = tuple(term(name, 0 if catalogue()[name].targeted else -1, 10) for name in names)
+        return SimpleNamespace(names=names, fit=SimpleNamespace(hypothesis=SimpleNamespace(terms=terms)))
+
+    found = SimpleNamespace(candidates=(candidate("push"), candidate("drag")), pairs=(candidate("slope", "push"),))
+    said = Answer("pair", 0.3, (0.9, 0.1), 0.6)
+    verdict, best = verdict_of(found, said, ("ball",), ("sphere",))
+    assert verdict.effects == ("push", "slope")
+    assert best is found.pairs[0]
+    assert verdict.sentence.index("ball") < verdict.sentence.index("floor")
 
 
 def test_an_effect_that_is_not_named_is_hardly_at_work():

@@ -126,6 +126,7 @@ def ranked(
     single = standing[0].names[0] if standing else ""
     pair = told.best if told.best is not None and len(told.best.names) > 1 else None
     rows = [row(pair, k, told.answer.of_pair(name, single)) for k, name in enumerate(pair.names)] if pair else []
+    rows.sort(key=lambda r: -r.probability)
     named = {(r.effect, r.target) for r in rows}
     others = []
     for candidate in compared.candidates:
