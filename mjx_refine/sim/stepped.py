@@ -41,7 +41,6 @@ def stepped_rollout(
     """
     count, objects = batch.mass.shape
     positions, step = 7 * objects, models[0].opt.timestep
-    applied = np.zeros((count, 1, models[0].nbody, 6))
     usual = np.array([model.pair_friction[:objects, 0] for model in models])
     current, warm = usual.copy(), np.zeros((count, models[0].nv))
     result = np.empty((count, frames - 1, positions))
@@ -57,13 +56,7 @@ def stepped_rollout(
             told = _about_the_mass(told, motion, centre)
             # A force that stays as it is turns a body that rotates about a mass elsewhere ever differently.
             steps = 1 if told[0].any() else steps
-        applied[:] = 0.0
-        if told is not None:
-            for part, load in enumerate(told):
-                turned = load if world is None else np.einsum("bji,bnj->bni", world, load)
-                applied[:, 0, 1:, 3 * part : 3 * part + 3] = turned
-            if not np.isfinite(applied).all():
-                np.nan_to_num(applied, copy=False)
+        applied = _applied(told, world, (count, models[0].nbody, 6))
         friction = acting.floor_friction(batch, motion)
         if friction is not None:
             wanted = np.where(np.isnan(friction), usual, friction)
@@ -91,6 +84,18 @@ def stepped_rollout(
     for row, model in enumerate(models):
         model.pair_friction[:objects, :2] = usual[row, :, None]
     return result
+
+
+def _applied(told: Loads | None, world: np.ndarray | None, shape: tuple[int, int, int]) -> np.ndarray:
+    """Loads on all bodies in the floor's axes, (batch, bodies, 6); the first body is the world."""
+    applied = np.zeros(shape)
+    if told is not None:
+        for part, load in enumerate(told):
+            turned = load if world is None else np.einsum("bji,bnj->bni", world, load)
+            applied[:, 1:, 3 * part : 3 * part + 3] = turned
+        if not np.isfinite(applied).all():
+            np.nan_to_num(applied, copy=False)
+    return applied
 
 
 def _about_the_mass(told: Loads, motion: Motion, centre: np.ndarray) -> Loads:
