@@ -82,14 +82,20 @@ def _diagnosed(
     crew.warm(clip)
     compared = compare(clip, start.scene, observation, start.matching, without, seed, told)
     told("held-out frames")
+    judged: dict[int, HeldOut] = {}
+
+    def outside_of(fit: Fit | None) -> HeldOut:
+        if id(fit) not in judged:
+            judged[id(fit)] = held_out(clip, compared.base, fit)
+        return judged[id(fit)]
+
     best = best_candidate(compared)
-    outside = held_out(clip, compared.base, best.fit if best else None)
+    outside = outside_of(best.fit if best else None)
     found = signs(clip, compared, outside.gain, outside.closed)
     leads = [c.lead for c in compared.candidates]
-    said = answer(found, leads, video=True)
-    said = upheld(said, compared, lambda fit: held_out(clip, compared.base, fit).closed)
+    said = upheld(answer(found, leads, video=True), compared, lambda fit: outside_of(fit).closed)
     told("report")
-    return _result(clip, compared, outside, found, said, problem, observation, start.matching, seed, began)
+    return _result(clip, compared, outside_of, found, said, problem, observation, start.matching, seed, began)
 
 
 def prepared(scene: Scene, observation: Observation, threads: int | None) -> tuple[Problem, Start, Measured]:
@@ -179,15 +185,14 @@ def _by_name(compared: Compared, said: Answer) -> dict[str, float]:
 
 
 def _result(
-    clip, compared, outside: HeldOut, found: Signs, said: Answer, problem, observation, matching, seed, began
+    clip, compared, outside_of, found: Signs, said: Answer, problem, observation, matching, seed, began
 ) -> Diagnosis:
     base = compared.base
     names, shapes = base.hypothesis.space.scene.names, base.hypothesis.space.scene.shapes
     verdict, best = verdict_of(compared, said, names, shapes)
     shown = best.fit if best else base
-    overall = best_candidate(compared)
-    if best is not None and (overall is None or best is not overall):
-        outside = held_out(clip, base, best.fit)
+    judged = best or best_candidate(compared)
+    outside = outside_of(judged.fit if judged else None)
     if best is None:
         outside = dataclasses.replace(outside, after=outside.before)
     view = view_of(clip, shown, observation, matching, hidden=False)

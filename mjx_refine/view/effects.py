@@ -180,13 +180,13 @@ def _world(poses: np.ndarray, batch: SceneBatch, image, fps: float, told: Layers
     ground = np.zeros((len(batch), poses.shape[1], 1, 7))
     ground[..., 3:] = turn
     seen = acting.apparent(np.concatenate([poses, ground], 2), batch, fps)
-    bodies, change = seen[:, :, :-1], None
+    bodies, reach, change = seen[:, :, :-1], None, None
     if told.outlined:
         view = outline_view(bodies, batch, image, DIRECTIONS, fps)
         change = acting.outline_change(dataclasses.replace(batch, effects=told.outlined), view)
+        reach = view.reach + change
     if widened and told.widening is not None:
-        reach = supports(bodies, batch, image, DIRECTIONS)
-        wide = width_change(reach if change is None else reach + change, told.widening)
+        wide = width_change(supports(bodies, batch, image, DIRECTIONS) if reach is None else reach, told.widening)
         change = wide if change is None else change + wide
     return seen, change
 
