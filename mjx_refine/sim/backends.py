@@ -103,9 +103,7 @@ def make_simulator(name: str, shapes: tuple[Shape, ...], fps: float, quick: bool
     name = resolve_backend(name)
     # Imported here, because JAX takes a second to import and C MuJoCo does without.
     if name == "warp":
-        from mjx_refine.sim.warp import WarpSimulator
-
-        return WarpSimulator(shapes, fps, *QUICK) if quick else WarpSimulator(shapes, fps)
+        return _warp(shapes, fps, quick)
     if name == "mjx":
         from mjx_refine.sim.mjx import MjxSimulator
 
@@ -113,3 +111,15 @@ def make_simulator(name: str, shapes: tuple[Shape, ...], fps: float, quick: bool
     from mjx_refine.sim.c import MujocoSimulator
 
     return MujocoSimulator(shapes, fps)
+
+
+def _warp(shapes: tuple[Shape, ...], fps: float, quick: bool) -> Simulator:
+    """MJX-Warp, or for searches the kernel that makes all steps of a candidate, where it has room for so many objects."""
+    if quick:
+        from mjx_refine.sim.fused.simulator import LARGEST, FusedSimulator
+
+        if len(shapes) <= LARGEST:
+            return FusedSimulator(shapes, fps)
+    from mjx_refine.sim.warp import WarpSimulator
+
+    return WarpSimulator(shapes, fps, *QUICK) if quick else WarpSimulator(shapes, fps)

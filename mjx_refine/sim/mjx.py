@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable
-from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -15,24 +14,13 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.compile_cache import compiling
 from mjx_refine.effects import acting
 from mjx_refine.scene import Shape
+from mjx_refine.sim.buckets import Launched, bucket, diverged_to_nan
 from mjx_refine.sim.carried import carried, refuse_loads
 from mjx_refine.sim.colliders import installed
 from mjx_refine.sim.devices import Devices
 from mjx_refine.sim.leaves import Leaves, candidate_model, leaves_of
 from mjx_refine.sim.mjx_import import mjx
 from mjx_refine.sim.model import SUBSTEPS, build_spec, initial_state
-
-BUCKETS = (1, 4, 16, 32, 64, 128, 256, 512, 1024, 1536, 2048, 3072, 4096, 6144, 8192)
-"""Batch sizes that programs are compiled for; a batch is padded to the next."""
-
-Launched: TypeAlias = Callable[[], Float[Array, "rows frames objects 7"]]
-"""A rollout that a device computes: waits for it."""
-
-
-def bucket(count: int) -> int:
-    """The smallest compiled batch size that holds ``count`` candidates."""
-    return next((size for size in BUCKETS if size >= count), -(-count // BUCKETS[-1]) * BUCKETS[-1])
-
 
 def room(count: int, compiled: Iterable[int], multiple: int = 1) -> int:
     """The batch size for ``count`` candidates: one that is compiled if it is not over four times as large (a batch's time
@@ -45,13 +33,6 @@ def padded(batch: SceneBatch, multiple: int = 1, compiled: Iterable[int] = ()) -
     """``batch`` with its last candidate repeated up to its ``room``."""
     size = room(len(batch), compiled, multiple)
     return batch[np.minimum(np.arange(size), len(batch) - 1)]
-
-
-def diverged_to_nan(poses: Float[np.ndarray, "batch frames objects 7"]) -> Float[np.ndarray, "batch frames objects 7"]:
-    """NaN from the first frame on in which any coordinate is not finite or any object is over 10 km away."""
-    bad = ~np.isfinite(poses).all((2, 3)) | (np.abs(poses[..., :3]) > 1e4).any((2, 3))
-    bad = np.logical_or.accumulate(bad, axis=1)
-    return np.where(bad[:, :, None, None], np.nan, poses)
 
 
 class MjxSimulator:

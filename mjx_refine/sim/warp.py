@@ -16,8 +16,8 @@ from mjx_refine.compile_cache import compiling
 from mjx_refine.effects import acting
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Shape
+from mjx_refine.sim.buckets import Launched, diverged_to_nan, rows_for
 from mjx_refine.sim.carried import carried, refuse_loads
-from mjx_refine.sim.mjx import Launched, bucket, diverged_to_nan
 from mjx_refine.sim.model import IDLE, build_spec, contact_pairs, field_arrays, initial_state, model_fields
 from mjx_refine.sim.warp_problem import REMEDY, warp_problem
 
@@ -26,13 +26,6 @@ if TYPE_CHECKING:
 
 _ITERATION_WARNINGS = (1 << 9) | (1 << 10)
 """Warp's ``OverflowType.ITERATIONS`` and ``LS_ITERATIONS``."""
-
-FINE = 128
-"""Worlds for at least as many candidates are made in multiples of it: thousands fill a GPU, and a size is recorded in a third
-of a second."""
-
-SPARE = 1.25
-"""Worlds with up to this many times the room serve fewer candidates."""
 
 KEPT = 4
 """Worlds of a scene kind that are kept."""
@@ -90,8 +83,7 @@ class WarpSimulator:
 
     def _room(self, count: int, frames: int) -> int:
         """Candidates to make worlds for: as some have that are there, if hardly more, else a few more than ``count``."""
-        there = [w.size for w in self._worlds if w.frames == frames and count <= w.size <= SPARE * count]
-        return min(there, default=bucket(count) if count < FINE else -(-count // FINE) * FINE)
+        return rows_for(count, [w.size for w in self._worlds if w.frames == frames])
 
     def _idle(self, size: int, frames: int, changed: dict[str, np.ndarray]) -> Worlds:
         """Worlds that no rollout is going on in."""

@@ -24,7 +24,8 @@ from mjx_refine.sim.colliders.cylinder_cylinder import cylinder_cylinder
 from mjx_refine.sim.colliders.plane import plane_box, plane_cylinder
 from mjx_refine.sim.colliders.sphere import sphere_box, sphere_cylinder
 from mjx_refine.sim.leaves import leaves_of
-from mjx_refine.sim.mjx import BUCKETS, MjxSimulator, bucket, diverged_to_nan, padded
+from mjx_refine.sim.buckets import BUCKETS, bucket, diverged_to_nan
+from mjx_refine.sim.mjx import MjxSimulator, padded
 from mjx_refine.sim.model import build_spec, initial_state
 from mjx_refine.sim.warp import WarpSimulator, contact_points
 from mjx_refine.sim.warp_problem import warp_problem

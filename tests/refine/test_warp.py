@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks.speed_scenes import KINDS, near
+from mjx_refine.sim.buckets import FINE, SPARE
 from mjx_refine.sim.c import MujocoSimulator
-from mjx_refine.sim.warp import FINE, KEPT, SPARE, WarpSimulator
+from mjx_refine.sim.warp import KEPT, WarpSimulator
 from mjx_refine.space import Space
 
 

@@ -12,10 +12,7 @@ from jaxtyping import Array, Float
 
 from mjx_refine.sim.colliders.contact import Geom, Points
 from mjx_refine.sim.colliders.directions import closest_on_lines, least_on_circle, towards, unit
-
-ALIGNED = float(np.cos(0.0889))
-SQUARE = float(np.sin(0.0889))
-"""Within 5.1 degrees, MuJoCo takes a face and a face, or a face and an edge, for parallel and gives several points."""
+from mjx_refine.sim.parallel import ALIGNED, SQUARE
 
 FAR = 1.0
 _UP = np.array([0.0, 0.0, 1.0], np.float32)

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_refine.sim.colliders.contact import Geom, Points
-from mjx_refine.sim.colliders.cylinder_box import ALIGNED, FAR, SQUARE, four_extremes
+from mjx_refine.sim.colliders.cylinder_box import FAR, four_extremes
 from mjx_refine.sim.colliders.directions import closest_on_lines, least_on_circle, least_smooth, towards, unit
+from mjx_refine.sim.parallel import ALIGNED, SQUARE
 
 _UP = np.array([0.0, 0.0, 1.0], np.float32)
 _RING = np.stack([np.cos(np.arange(16) * np.pi / 8), np.sin(np.arange(16) * np.pi / 8)], -1)
