@@ -18,7 +18,7 @@ PARTS = ("world", "simple", "convex", "solver", "rollout")
 NEWTON, LINE = 8, 6
 """Newton's iterations a step, and slopes that a line search looks at, at most."""
 
-TOLERANCE = 1e-7
+TOLERANCE = 1e-6
 """Newton's decrement, over the bodies' mean inertia, at which a step ends [m^2/s^4]."""
 
 MOST = 32
@@ -26,8 +26,11 @@ MOST = 32
 
 LANES = 32
 
+CONVEX = {"CYLINDERS": 7, "CYLINDER_AND_BOX": 10, "BOXES": 11}
+"""Kinds of pairs that all lanes work on together, by the names that the source has for their presence."""
 
-def _source(bodies: int, spots: int) -> str:
+
+def _source(bodies: int, spots: int, kinds: frozenset[int]) -> str:
     """The kernel's C++, the body of a function: its structures are local to it."""
     numbers = {
         "BODIES": bodies,
@@ -41,6 +44,7 @@ def _source(bodies: int, spots: int) -> str:
         "TOLERANCE": f"{TOLERANCE:.9e}f",
         "ALIGNED": f"{ALIGNED:.9f}f",
         "SQUARE": f"{SQUARE:.9f}f",
+        **{name: int(kind in kinds) for name, kind in CONVEX.items()},
     }
     defined = "\n".join(f"#define {name} {value}" for name, value in numbers.items())
     parts = "\n".join(resources.files(__package__).joinpath(f"{part}.h").read_text() for part in PARTS)
@@ -72,14 +76,14 @@ engine.run(packed.data + candidate * width, plan.data, poses.data + candidate * 
 
 
 @functools.cache
-def kernel(bodies: int, spots: int) -> Any:
-    """The kernel for so many bodies, and points where their pairs may touch.
+def kernel(bodies: int, spots: int, kinds: frozenset[int]) -> Any:
+    """The kernel for so many bodies, points where their pairs may touch, and kinds of ``CONVEX`` among the pairs.
 
     Its inputs: the packed candidates (flat) and how many numbers each has, the plan of pairs, frames, time step [s], and the poses that
     it writes (flat). It is launched with a warp a candidate on a GPU, and one thread a candidate on a CPU.
     """
 
-    @wp.func_native(_source(bodies, spots))
+    @wp.func_native(_source(bodies, spots, kinds))
     def simulate(
         thread: int,
         packed: wp.array(dtype=float),
@@ -90,7 +94,7 @@ def kernel(bodies: int, spots: int) -> Any:
         poses: wp.array(dtype=float),
     ): ...
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options={"fast_math": True})
     def rollout(
         packed: wp.array(dtype=float),
         width: int,

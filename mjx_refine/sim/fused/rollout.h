@@ -20,6 +20,10 @@ CUDA_CALLABLE void read(const float* packed, const int* plan) {
         int end = p + 1 < PAIRS ? plan[4 * p + 7] : SPOTS;
         for (int s = plan[4 * p + 3]; s < end; s++) room.spot[s].pair = p;
     }
+    EACH(i, 12) for (int j = 0; j <= i; j++) {
+        room.line[i * (i + 1) / 2 + j] = i;
+        room.column[i * (i + 1) / 2 + j] = j;
+    }
     SYNC;
 }
 

@@ -20,7 +20,7 @@ from mjx_refine.rotations import rotate
 from mjx_refine.scene import Shape
 from mjx_refine.sim.buckets import Launched, diverged_to_nan, rows_for
 from mjx_refine.sim.carried import carried, refuse_loads
-from mjx_refine.sim.fused.kernel import LANES, kernel
+from mjx_refine.sim.fused.kernel import CONVEX, LANES, kernel
 from mjx_refine.sim.model import SUBSTEPS, contact_pairs, initial_state, model_fields
 from mjx_refine.sim.warp_problem import REMEDY, warp_problem
 
@@ -97,12 +97,13 @@ class FusedSimulator:
         self._on = wp.get_device()
         self._stream = wp.Stream(self._on) if self._on.is_cuda else None
         rows, self._points = plan(shapes)
+        self._kinds = frozenset(int(kind) for kind in rows[:, 2]) & frozenset(CONVEX.values())
         self._plan = wp.array(rows.reshape(-1), dtype=int, device=self._on)
         self._sizes: set[int] = set()
 
     @functools.cached_property
     def _kernel(self) -> Any:
-        made = kernel(len(self.shapes), self._points)
+        made = kernel(len(self.shapes), self._points, self._kinds)
         with compiling(f"the kernel of {len(self.shapes)} objects"):
             made.module.load(self._on, self._lanes)
         return made

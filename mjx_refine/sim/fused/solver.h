@@ -41,9 +41,10 @@ CUDA_CALLABLE void collide() {
         bool both = pair.kind == 7 || pair.kind == 10 || pair.kind == 11;
         if (!both || !near(pair)) continue;
         const Body &a = room.body[pair.first], &b = room.body[pair.second];
-        if (pair.kind == 7) cylinder_cylinder(p, a, b);
-        else if (pair.kind == 10) cylinder_box(p, a, b);
-        else box_box(p, a, b);
+        // Only what the scene kind has is compiled.
+        if (CYLINDERS && pair.kind == 7) cylinder_cylinder(p, a, b);
+        if (CYLINDER_AND_BOX && pair.kind == 10) cylinder_box(p, a, b);
+        if (BOXES && pair.kind == 11) box_box(p, a, b);
         SYNC;
     }
     SYNC;
@@ -224,42 +225,89 @@ CUDA_CALLABLE void differentiate() {
     SYNC;
 }
 
+CUDA_CALLABLE void add(int i, int j, float value) {
+    const int wide = DOFS + 1;
+    room.hessian[i >= j ? i * wide + j : j * wide + i] += value;
+}
+
+// The lower triangle of the Hessian: of the bodies, then of one contact after the other, whose entries the lanes share.
 CUDA_CALLABLE void curvature() {
     const int wide = DOFS + 1;
-    EACH(e, DOFS * (DOFS + 1) / 2) {
-        int i = (int)((sqrtf(8.0f * e + 1.0f) - 1.0f) * 0.5f);
-        if ((i + 1) * (i + 2) / 2 <= e) i++;
-        if (i * (i + 1) / 2 > e) i--;
-        int j = e - i * (i + 1) / 2, p = i / 6, q = j / 6, a = i % 6, b = j % 6;
-        float sum = 0.0f;
-        if (p == q) {
-            const Body& body = room.body[p];
-            if (a < 3) sum = a == b ? body.mass : 0.0f;
-            else if (b >= 3) sum = body.spun[3 * (a - 3) + b - 3];
-        }
-        for (int k = 0; k < room.count; k++) {
-            const Contact& c = room.contact[k];
-            if (c.zone == TOP) continue;
-            int first = c.second == p ? 6 + a : (c.first == p ? a : -1);
-            int second = c.second == q ? 6 + b : (c.first == q ? b : -1);
-            if (first < 0 || second < 0) continue;
-            float across = 0.0f, normal = c.rows[0][first] * c.rows[0][second];
-            for (int r = 1; r < 6; r++) across += c.rows[r][first] * c.rows[r][second];
-            if (c.zone == BOTTOM) {
-                sum += c.bend * (normal + across);
-            } else {
-                float s = c.along[first], t = c.along[second], mu = c.mu;
-                sum += c.bend * (normal - mu * (c.rows[0][first] * t + c.rows[0][second] * s) + c.pull * s * t +
-                                 (mu * mu - c.pull) * across);
-            }
-        }
-        room.hessian[i * wide + j] = sum;
+    EACH(e, DOFS * wide) room.hessian[e] = 0.0f;
+    SYNC;
+    EACH(i, BODIES) {
+        const Body& b = room.body[i];
+        for (int j = 0; j < 3; j++) room.hessian[(6 * i + j) * wide + 6 * i + j] = b.mass;
+        for (int j = 0; j < 3; j++)
+            for (int k = 0; k <= j; k++) room.hessian[(6 * i + 3 + j) * wide + 6 * i + 3 + k] = b.spun[3 * j + k];
     }
     EACH(i, DOFS) room.hessian[DOFS * wide + i] = -room.slope[i];
+    for (int k = 0; k < room.count; k++) {
+        const Contact& c = room.contact[k];
+        if (c.zone == TOP) continue;
+        SYNC;
+        // Of a contact with the floor the second body's columns alone.
+        int from = c.first < 0 ? 6 : 0;
+        EACH(e, c.first < 0 ? 21 : 78) {
+            int i = from + room.line[e], j = from + room.column[e];
+            float across = 0.0f, normal = c.rows[0][i] * c.rows[0][j], entry;
+            for (int r = 1; r < 6; r++) across += c.rows[r][i] * c.rows[r][j];
+            if (c.zone == BOTTOM) {
+                entry = normal + across;
+            } else {
+                float s = c.along[i], t = c.along[j], mu = c.mu;
+                entry = normal - mu * (c.rows[0][i] * t + c.rows[0][j] * s) + c.pull * s * t + (mu * mu - c.pull) * across;
+            }
+            add(i < 6 ? 6 * c.first + i : 6 * c.second + i - 6, j < 6 ? 6 * c.first + j : 6 * c.second + j - 6,
+                c.bend * entry);
+        }
+    }
     SYNC;
 }
 
-// Cholesky's factorisation with the right side as a last row, then back.
+#if defined(__CUDA_ARCH__) && DOFS < LANES
+
+// Cholesky's factorisation, a row a lane in its registers, with the right side as a last row; then back.
+CUDA_CALLABLE void solve() {
+    const int wide = DOFS + 1;
+    const unsigned all = 0xffffffffu;
+    float row[DOFS], x = 0.0f, scale = 1.0f;
+#pragma unroll
+    for (int j = 0; j < DOFS; j++) row[j] = lane <= DOFS && (j <= lane) ? room.hessian[lane * wide + j] : 0.0f;
+#pragma unroll
+    for (int k = 0; k < DOFS; k++) {
+        float one = rsqrtf(most(__shfl_sync(all, row[k], k), 1e-12f));
+        if (lane == k) scale = one;
+        row[k] *= one;
+#pragma unroll
+        for (int j = k + 1; j < DOFS; j++) row[j] -= row[k] * __shfl_sync(all, row[k], j);
+    }
+    if (lane < DOFS) {
+#pragma unroll
+        for (int j = 0; j < DOFS; j++)
+            if (j <= lane) room.hessian[lane * wide + j] = row[j];
+    }
+#pragma unroll
+    for (int j = 0; j < DOFS; j++) {
+        float right = __shfl_sync(all, row[j], DOFS);
+        if (lane == j) x = right;
+    }
+    __syncwarp();
+    float below[DOFS];
+#pragma unroll
+    for (int k = 0; k < DOFS; k++) below[k] = lane < k ? room.hessian[k * wide + lane] : 0.0f;
+#pragma unroll
+    for (int k = DOFS - 1; k >= 0; k--) {
+        float known = __shfl_sync(all, x * scale, k);
+        x = lane == k ? known : x - below[k] * known;
+    }
+    if (lane < DOFS) room.step[lane] = x;
+    __syncwarp();
+}
+
+#else
+
+// The same in memory.
 CUDA_CALLABLE void solve() {
     const int wide = DOFS + 1;
     for (int k = 0; k < DOFS; k++) {
@@ -290,6 +338,8 @@ CUDA_CALLABLE void solve() {
         SYNC;
     }
 }
+
+#endif
 
 // How far to go along the step: the zero of the cost's slope there.
 CUDA_CALLABLE float length_of_step() {
@@ -364,7 +414,10 @@ CUDA_CALLABLE void move(float dt) {
         for (int j = 0; j < 6; j++) b.vel[j] += dt * room.acc[6 * i + j];
         for (int j = 0; j < 3; j++) b.pos[j] += dt * b.vel[j];
         V w = load(b.vel + 3);
-        float speed = sqrtf(w.square()), half = 0.5f * dt * speed, c = cosf(half), s = speed > 1e-12f ? sinf(half) / speed : 0.0f;
+        // Half the angle of a step is small: cosine and sine by their series.
+        float h = 0.25f * dt * dt * w.square();
+        float c = 1.0f - h * (0.5f - h * (1.0f / 24.0f - h / 720.0f));
+        float s = 0.5f * dt * (1.0f - h * (1.0f / 6.0f - h * (1.0f / 120.0f - h / 5040.0f)));
         float x = w.x * s, y = w.y * s, z = w.z * s, *q = b.quat;
         float p[4] = {c * q[0] - x * q[1] - y * q[2] - z * q[3], c * q[1] + x * q[0] + y * q[3] - z * q[2],
                       c * q[2] + y * q[0] + z * q[1] - x * q[3], c * q[3] + z * q[0] + x * q[2] - y * q[1]};

@@ -78,6 +78,7 @@ struct Room {
     float calm[DOFS], acc[DOFS], last[DOFS], slope[DOFS], step[DOFS], pushed[DOFS];
     float point[40][3], gap[40];
     int valid[40], extreme[8], chosen[8];
+    int line[78], column[78];  // of the entries of a triangle
     int count;
 };
 
