@@ -53,13 +53,12 @@ def outlines(masks: Int[np.ndarray, "frames height width"], count: int = DIRECTI
 def _measure(frame: np.ndarray, i: int, normals: np.ndarray):
     """(area, centroid, support) of one mask in one frame, or None where it is absent."""
     height, width = frame.shape
-    inside_rows = np.nonzero((frame == i).any(1))[0]
-    if len(inside_rows) == 0:
+    box = _box(frame, i)
+    if box is None:
         return None
     # Only the mask's surroundings are looked at: two pixels beyond its box.
-    inside_columns = np.nonzero((frame[inside_rows[0] : inside_rows[-1] + 1] == i).any(0))[0]
-    top, left = max(inside_rows[0] - 2, 0), max(inside_columns[0] - 2, 0)
-    part = frame[top : inside_rows[-1] + 3, left : inside_columns[-1] + 3]
+    top, left = (max(side.start - 2, 0) for side in box)
+    part = frame[top : box[0].stop + 2, left : box[1].stop + 2]
     mask = part == i
     area = int(np.count_nonzero(mask))
     rows, columns = np.nonzero(mask)
@@ -73,6 +72,16 @@ def _measure(frame: np.ndarray, i: int, normals: np.ndarray):
     rows, columns = rows[extreme] + top, columns[extreme] + left
     cut = (rows < 2) | (columns < 2) | (rows >= height - 2) | (columns >= width - 2) | others
     return area, centre, np.where(cut, np.nan, reach)
+
+
+def _box(frame: Int[np.ndarray, "height width"], i: int) -> tuple[slice, slice] | None:
+    """Rows and columns that hold mask ``i``, or None where it is absent."""
+    rows = np.nonzero((frame == i).any(1))[0]
+    if len(rows) == 0:
+        return None
+    within = slice(int(rows[0]), int(rows[-1]) + 1)
+    columns = np.nonzero((frame[within] == i).any(0))[0]
+    return within, slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 def _beyond(along: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -108,13 +117,16 @@ def flow_points(
     seen = np.full_like(pixels, np.nan)
     for t in range(len(flow)):
         for j, i in enumerate(ids):
+            box = _box(masks[t], i)
+            if box is None:
+                continue
             # Flow is measured worst at the edge.
-            inside = ndimage.binary_erosion(masks[t] == i, iterations=2)
-            rows, columns = np.nonzero(inside & np.isfinite(flow[t]).all(-1))
+            inside = ndimage.binary_erosion(masks[t][box] == i, iterations=2)
+            rows, columns = np.nonzero(inside & np.isfinite(flow[t][box]).all(-1))
             if len(rows) < POINTS:
                 continue
             chosen = np.linspace(0, len(rows) - 1, POINTS + 2).astype(int)[1:-1]
-            rows, columns = rows[chosen], columns[chosen]
+            rows, columns = rows[chosen] + box[0].start, columns[chosen] + box[1].start
             pixels[t, j] = np.stack([columns + 0.5, rows + 0.5], -1)
             seen[t, j] = flow[t, rows, columns]
     return pixels, seen

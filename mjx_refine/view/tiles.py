@@ -88,14 +88,15 @@ class TileScorer:
     def _build(self, observation: Observation, matching: tuple[int, ...]) -> None:
         rows, columns = self._rows, self._columns
         outside = (rows[:, None] < 0) | (columns[None, :] < 0)
-        masks = foreground(observation)
+        masks = foreground(observation)[:, rows][:, :, columns]
         ids = np.full(masks.shape, len(self.shapes) + 1, np.int32) * (masks > 0)
         for n, i in enumerate(matching):
             if i != UNMATCHED:
                 ids[masks == i] = n + 1
-        ids = np.where(outside, 0, ids[:, rows][:, :, columns])
-        flow = np.full((self.length, *outside.shape, 2), np.nan, np.float32)
-        flow[:-1] = np.where(outside[..., None], np.nan, observation.flow[:, rows][:, :, columns])
+        ids[:, outside] = 0
+        flow = np.full((2, self.length, *outside.shape), np.nan, np.float32)
+        flow[:, :-1] = np.moveaxis(observation.flow[:, rows][:, :, columns], -1, 0)
+        flow[:, :, outside] = np.nan
         if self.moving_only:
             ids[-1] = 0
         x = np.where(outside, -1e6, columns[None, :] + 0.5)
@@ -105,23 +106,24 @@ class TileScorer:
             x=jnp.asarray(_tiled(x[None])[0], jnp.float32),
             y=jnp.asarray(_tiled(y[None])[0], jnp.float32),
             ids=jnp.asarray(_tiled(ids)),
-            flow_x=jnp.asarray(_tiled(flow[..., 0])),
-            flow_y=jnp.asarray(_tiled(flow[..., 1])),
+            flow_x=jnp.asarray(_tiled(flow[0])),
+            flow_y=jnp.asarray(_tiled(flow[1])),
         )
-        speed = np.linalg.norm(flow.astype(np.float64), axis=-1)
+        along, across = flow.astype(np.float64)
+        speed = np.sqrt(along * along + across * across)
         valid, on_object = np.isfinite(speed), ids > 0
-        speed = np.where(valid, speed, 0.0)
+        speed[~valid] = 0.0
 
-        def total(pixels: np.ndarray) -> np.ndarray:
-            return pixels.sum((1, 2), dtype=np.float64)
+        def count(pixels: np.ndarray) -> np.ndarray:
+            return np.count_nonzero(pixels, axis=(1, 2)).astype(np.float64)
 
         self._observed = {
-            "foreground": total(on_object),
-            "objects": np.stack([total(ids == n + 1) for n in range(len(self.shapes))], -1),
-            "still": total(speed)[:-1],
-            "measured": total(valid)[:-1],
-            "still_object": total(np.where(on_object, speed, 0.0))[:-1],
-            "measured_object": total(valid & on_object)[:-1],
+            "foreground": count(on_object),
+            "objects": np.stack([count(ids == n + 1) for n in range(len(self.shapes))], -1),
+            "still": speed.sum((1, 2))[:-1],
+            "measured": count(valid)[:-1],
+            "still_object": np.where(on_object, speed, 0.0).sum((1, 2))[:-1],
+            "measured_object": count(valid & on_object)[:-1],
         }
 
     def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Scores:
