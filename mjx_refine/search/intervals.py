@@ -69,6 +69,9 @@ and no clip tells."""
 RIDGES = (0.0, 0.1, 1.0, 10.0, 100.0)
 TRIALS = np.array([1e-4, 1e-2, 1.0, 1e2, 1e4])
 
+FEW, REMEMBERED = 8, 64
+"""Rows of a batch whose distances are kept, and how many are: the trials of a fit."""
+
 SCALED = ("m", "m/s", "m/s^2")
 """Units of what the overall scale multiplies."""
 
@@ -138,16 +141,29 @@ class _Posterior:
         objects, directions = squares.target.shape[1:]
         self.points = 0 if squares.flow is None else squares.flow.shape[2]
         self.noise = unmeasured(self.frames, objects, directions, self.points)
+        self._known: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+
+    def _distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """``squares.distances`` over all frames; what one fit ends with the next begins with, and is not simulated again."""
+        if len(points) == 1 and points.tobytes() in self._known:
+            return self._known[points.tobytes()]
+        told = self.squares.distances(points, self.frames)
+        if len(points) <= FEW:
+            for row in range(len(points)):
+                self._known[points[row].tobytes()] = tuple(part[row : row + 1] for part in told)  # type: ignore[assignment]
+            while len(self._known) > REMEMBERED:
+                del self._known[next(iter(self._known))]
+        return told
 
     def measure_noise(self, point: np.ndarray) -> None:
         """What the residuals at ``point`` scatter by, and simulations that start next to it."""
-        reach, flow, _ = self.squares.distances(point[None], self.frames)
+        reach, flow, _ = self._distances(point[None])
         self.noise = measured(reach[0], flow[0], self.squares.pixels / self.squares.pixel)
         draws = np.random.default_rng(0).standard_normal((DRAWS, len(point))) * TREMBLE * self.space.sigma
         self.noise = self.noise.with_scatter(self._standardised(np.clip(point + draws, 0.0, 1.0))[0])
 
     def _standardised(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        reach, flow, bad = self.squares.distances(points, self.frames)
+        reach, flow, bad = self._distances(points)
         return slowed(self.noise.standardised(reach, flow).reshape(len(points), -1), CAUCHY), bad
 
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

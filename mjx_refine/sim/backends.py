@@ -18,8 +18,8 @@ from mjx_refine.sim.carried import refuse_loads
 BACKENDS = ("auto", "mjx", "warp", "mujoco")
 
 FEW_A_CORE = 3
-"""Candidates in a batch for each core below which C MuJoCo is as fast as a GPU, where a few candidates take as long as hundreds: box and
-cylinder, 16 cores and an H100: 128 candidates 76 and 29 ms."""
+"""Candidates in a batch for each core below which C MuJoCo is as fast as a GPU, where a few candidates take as long as hundreds:
+box and cylinder, 16 cores and an H100: 128 candidates 67 and 11 ms."""
 
 QUICK = (5, 4)
 """Newton and line-search iterations of MJX-Warp for a search: a batch waits for its slowest candidate. 64 candidates against C

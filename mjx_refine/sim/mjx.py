@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from mjx_refine.sim.devices import Devices
 from mjx_refine.sim.leaves import Leaves, candidate_model, leaves_of
 from mjx_refine.sim.mjx_import import mjx
 from mjx_refine.sim.model import SUBSTEPS, build_spec, initial_state
+
 
 def room(count: int, compiled: Iterable[int], multiple: int = 1) -> int:
     """The batch size for ``count`` candidates: one that is compiled if it is not over four times as large (a batch's time

@@ -1,4 +1,7 @@
-"""What MuJoCo's convex collider takes for parallel: within 5.1 degrees a face and a face, or a face and an edge, have several points."""
+"""What MuJoCo's convex collider takes for parallel.
+
+Within 5.1 degrees a face and a face, or a face and an edge, touch in several points.
+"""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,9 @@ from mjx_refine.view.frames import camera_matrix, rotation_matrix
 
 BATCHES = (8, 32, 128)
 """Batch sizes that are compiled; larger batches are multiples of the last."""
+
+PIECE = 32
+"""Rows in one call where a batch of more than so many is taken in pieces."""
 
 NEAR = 0.02
 """Depth [m] in front of which an object is moved ahead: no picture of it is bounded there."""
@@ -197,8 +201,26 @@ def padded(
     """
     arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
     size = next((b for b in sizes if b >= len(poses)), -(-len(poses) // sizes[-1]) * sizes[-1])
-    longer = (np.concatenate([a, np.repeat(a[:1], size - len(a), 0)]) for a in map(np.asarray, arrays))
-    return tuple(jnp.asarray(a, jnp.float32) for a in longer)  # type: ignore[return-value]
+    # Rounded here: on the device it is a program of its own for each.
+    longer = (
+        np.concatenate([a, np.repeat(a[:1], size - len(a), 0)], dtype=np.float32) for a in map(np.asarray, arrays)
+    )
+    return tuple(jnp.asarray(a) for a in longer)  # type: ignore[return-value]
+
+
+def in_pieces(
+    function: Callable[[Arrays], Array], poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch
+) -> Float[np.ndarray, "batch ..."]:
+    """``function`` of ``padded`` arrays, which takes each row by itself: 39 rows are two pieces of 32 then, not 128."""
+    if len(poses) <= PIECE:
+        return np.asarray(function(padded(poses, batch)))[: len(poses)]
+    parts, first = [], 0
+    while first < len(poses):
+        size = PIECE if len(poses) - first <= BATCHES[-1] - PIECE else BATCHES[-1]
+        rows = slice(first, first + size)
+        parts.append(function(padded(poses[rows], batch[rows], (size,))))
+        first += size
+    return np.concatenate([np.asarray(part) for part in parts])[: len(poses)]
 
 
 _support_function = jax.jit(support_function, static_argnums=(0, 2, 3))
@@ -212,4 +234,4 @@ def supports(
     The support function of a convex outline, h(n) = max over its points p of n . p (Schneider, Convex Bodies, 1.7).
     Occlusion and the image's border do not matter to it.
     """
-    return np.asarray(_support_function(batch.shapes, padded(poses, batch), count, image))[: len(poses)]
+    return in_pieces(lambda arrays: _support_function(batch.shapes, arrays, count, image), poses, batch)

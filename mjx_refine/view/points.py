@@ -11,7 +11,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.scene import Shape
 from mjx_refine.view.distance import surface
 from mjx_refine.view.frames import make_frames
-from mjx_refine.view.outline import Arrays, larger, padded
+from mjx_refine.view.outline import Arrays, in_pieces, larger
 
 
 def point_flow_function(
@@ -54,5 +54,5 @@ def point_flow(
 
     Where the ray misses the object, that of a point fixed to it beside its outline; zero in the last frame.
     """
-    told = _point_flow(batch.shapes, padded(poses, batch), jnp.asarray(pixels, jnp.float32), image)
-    return np.asarray(told)[: len(poses)]
+    where = jnp.asarray(np.asarray(pixels, np.float32))
+    return in_pieces(lambda arrays: _point_flow(batch.shapes, arrays, where, image), poses, batch)

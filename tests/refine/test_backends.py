@@ -16,6 +16,7 @@ from benchmarks.parity import pair_rows, scene_batch, single_rows
 from mjx_refine import compile_cache
 from mjx_refine.errors import InputError
 from mjx_refine.sim import backends
+from mjx_refine.sim.buckets import BUCKETS, bucket, diverged_to_nan
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.sim.colliders import hook
 from mjx_refine.sim.colliders.box_box import box_box
@@ -24,7 +25,6 @@ from mjx_refine.sim.colliders.cylinder_cylinder import cylinder_cylinder
 from mjx_refine.sim.colliders.plane import plane_box, plane_cylinder
 from mjx_refine.sim.colliders.sphere import sphere_box, sphere_cylinder
 from mjx_refine.sim.leaves import leaves_of
-from mjx_refine.sim.buckets import BUCKETS, bucket, diverged_to_nan
 from mjx_refine.sim.mjx import MjxSimulator, padded
 from mjx_refine.sim.model import build_spec, initial_state
 from mjx_refine.sim.warp import WarpSimulator, contact_points

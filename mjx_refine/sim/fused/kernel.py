@@ -47,7 +47,7 @@ def _source(bodies: int, spots: int, kinds: frozenset[int]) -> str:
         **{name: int(kind in kinds) for name, kind in CONVEX.items()},
     }
     defined = "\n".join(f"#define {name} {value}" for name, value in numbers.items())
-    parts = "\n".join(resources.files(__package__).joinpath(f"{part}.h").read_text() for part in PARTS)
+    parts = "\n".join(resources.files("mjx_refine.sim.fused").joinpath(f"{part}.h").read_text() for part in PARTS)
     undefined = "\n".join(f"#undef {name}" for name in (*numbers, "LANES", "SYNC", "EACH"))
     return f"""
 {defined}
@@ -79,8 +79,8 @@ engine.run(packed.data + candidate * width, plan.data, poses.data + candidate * 
 def kernel(bodies: int, spots: int, kinds: frozenset[int]) -> Any:
     """The kernel for so many bodies, points where their pairs may touch, and kinds of ``CONVEX`` among the pairs.
 
-    Its inputs: the packed candidates (flat) and how many numbers each has, the plan of pairs, frames, time step [s], and the poses that
-    it writes (flat). It is launched with a warp a candidate on a GPU, and one thread a candidate on a CPU.
+    Its inputs: the packed candidates (flat) and how many numbers each has, the plan of pairs, frames, time step [s], and the
+    poses that it writes (flat). It is launched with a warp a candidate on a GPU, and one thread a candidate on a CPU.
     """
 
     @wp.func_native(_source(bodies, spots, kinds))
