@@ -71,7 +71,7 @@ class Clip:
 def generations(clip: Clip, backend: str, population: int, count: int, width: int) -> Parts:
     """Runs the population search for a first and ``count`` further generations and times its parts."""
     observation, space = clip.observation, clip.space
-    simulator = make_simulator(backend, clip.truth.shapes, observation.fps)
+    simulator = make_simulator(backend, clip.truth.shapes, observation.fps, quick=True)
     height = round(width * observation.size[1] / observation.size[0])
     scorer = TileScorer(clip.truth.shapes, observation, clip.matching, (width, height))
     settings = mjx_cmaes.Settings(dimension=space.dimension, population=population, tolerance_x=0.0, tolerance_cost=0.0)

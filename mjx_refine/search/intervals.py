@@ -147,13 +147,13 @@ class _Posterior:
         """``squares.distances`` over all frames; what one fit ends with the next begins with, and is not simulated again."""
         if len(points) == 1 and points.tobytes() in self._known:
             return self._known[points.tobytes()]
-        told = self.squares.distances(points, self.frames)
+        reach, flow, bad = self.squares.distances(points, self.frames)
         if len(points) <= FEW:
-            for row in range(len(points)):
-                self._known[points[row].tobytes()] = tuple(part[row : row + 1] for part in told)  # type: ignore[assignment]
+            for k, point in enumerate(points):
+                self._known[point.tobytes()] = reach[k : k + 1], flow[k : k + 1], bad[k : k + 1]
             while len(self._known) > REMEMBERED:
                 del self._known[next(iter(self._known))]
-        return told
+        return reach, flow, bad
 
     def measure_noise(self, point: np.ndarray) -> None:
         """What the residuals at ``point`` scatter by, and simulations that start next to it."""

@@ -85,6 +85,20 @@ def test_the_same_seed_gives_the_same_intervals():
     assert one.free == two.free
 
 
+def test_no_point_is_simulated_twice_by_itself(monkeypatch):
+    clip, asked = Clip(1), []
+    simulated = clip.fit.distances
+
+    def distances(points, frames):
+        asked.extend(point.tobytes() for point in points if len(points) == 1)
+        return simulated(points, frames)
+
+    monkeypatch.setattr(clip.fit, "distances", distances)
+    intervals(clip.fit, clip.space.start, 2, 0)
+    assert asked
+    assert len(set(asked)) == len(asked)
+
+
 def test_an_unseen_object_determines_nothing():
     clip = Clip(2)
     clip.fit.target[:] = np.nan

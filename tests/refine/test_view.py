@@ -19,6 +19,7 @@ from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.view.frames import frames_of_batch
 from mjx_refine.view.outline import directions, supports
 from mjx_refine.view.picture import draw
+from mjx_refine.view.points import point_flow
 from mjx_refine.view.tiles import TileScorer, foreground
 
 SIZE = (97, 61)
@@ -346,6 +347,20 @@ def test_outlines_do_not_depend_on_the_batch(count):
     assert together.shape == (count, 2, 3, 8)
     alone = supports(poses[-1:], batch[count - 1 :], SIZE, 8)
     np.testing.assert_allclose(together[-1:], alone, rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("count", [33, 64, 96, 97, 161])
+def test_outlines_and_flow_are_the_same_in_pieces(count):
+    batch = candidates(count, 6)
+    poses = MujocoSimulator(batch.shapes, 30.0, 1).rollout(batch, 2)
+    pixels = np.random.default_rng(0).uniform(0, 100, (2, 3, 5, 2))
+    parts = [slice(k, k + 32) for k in range(0, count, 32)]
+    apart = np.concatenate([supports(poses[rows], batch[rows], SIZE, 8) for rows in parts])
+    np.testing.assert_allclose(supports(poses, batch, SIZE, 8), apart, rtol=1e-5, atol=1e-3)
+    apart = np.concatenate([point_flow(poses[rows], batch[rows], pixels, SIZE) for rows in parts])
+    together = point_flow(poses, batch, pixels, SIZE)
+    assert together.shape == (count, 2, 3, 5, 2)
+    np.testing.assert_allclose(together, apart, rtol=1e-4, atol=1e-2)
 
 
 @pytest.mark.parametrize("place", [(-3.0, 0.0), (0.0, 1.5), (0.3, 0.2), (1.02, 0.0)])
