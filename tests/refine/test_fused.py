@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-wp = pytest.importorskip("warp")
+pytest.importorskip("warp")
 
 from benchmarks.speed_scenes import KINDS, near  # noqa: E402
 from mjx_refine.effects import batch_with_effects  # noqa: E402
 from mjx_refine.errors import InputError  # noqa: E402
 from mjx_refine.scene import Body, Effect, Scene  # noqa: E402
 from mjx_refine.sim.c import MujocoSimulator  # noqa: E402
-from mjx_refine.sim.fused.kernel import CONVEX  # noqa: E402
+from mjx_refine.sim.fused.kernel import CONVEX, LANES  # noqa: E402
 from mjx_refine.sim.fused.simulator import LARGEST, FusedSimulator, packed, plan  # noqa: E402
 from mjx_refine.sim.model import contact_pairs  # noqa: E402
 from mjx_refine.sim.warp import contact_points  # noqa: E402
@@ -131,11 +131,12 @@ def test_more_objects_than_a_block_has_memory_for_are_refused():
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("name", SCENES)
-def test_a_warp_finds_what_one_lane_finds(name):
+@pytest.mark.parametrize("name", KINDS)
+def test_a_warp_of_a_gpu_finds_what_c_mujoco_finds(name):
     batch = candidates(name)
-    many = made(batch).rollout(batch, 12)
-    with wp.ScopedDevice("cpu"):
-        one = made(batch).rollout(batch, 12)
-    assert np.median(apart(many, one, 5)) < 1e-5
-    assert np.median(apart(many, one, 11)) < 2e-3
+    simulator = made(batch)
+    own, c = simulator.rollout(batch, 13), MujocoSimulator(batch.shapes, 30.0).rollout(batch, 13)
+    assert simulator._lanes == LANES
+    assert np.median(apart(own, c, 5)) < 2e-5
+    assert np.median(apart(own, c, 12)) < 3e-3
+    np.testing.assert_array_equal(simulator.rollout(batch, 13), own)

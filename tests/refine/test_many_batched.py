@@ -306,7 +306,7 @@ def test_batches_take_a_size_that_is_compiled():
 def test_few_candidates_are_for_the_cores(monkeypatch):
     monkeypatch.setattr(backends, "resolve_backend", lambda name: "warp" if name == "auto" else name)
     monkeypatch.setattr(backends, "cores", lambda: 16)
-    assert [backends.fastest("auto", n) for n in (128, 384, 385)] == ["mujoco", "mujoco", "warp"]
+    assert [backends.fastest("auto", n) for n in (32, 48, 49)] == ["mujoco", "mujoco", "warp"]
     assert backends.fastest("warp", 1) == "warp"
     assert backends.fastest("mjx", 1) == "mjx"
     monkeypatch.setenv(backends.OFFERED, "warp")  # what a worker beside the GPU's process has
