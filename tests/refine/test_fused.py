@@ -9,15 +9,15 @@ import pytest
 
 pytest.importorskip("warp")
 
-from benchmarks.speed_scenes import KINDS, near  # noqa: E402
-from mjx_refine.effects import batch_with_effects  # noqa: E402
-from mjx_refine.errors import InputError  # noqa: E402
-from mjx_refine.scene import Body, Effect, Scene  # noqa: E402
-from mjx_refine.sim.c import MujocoSimulator  # noqa: E402
-from mjx_refine.sim.fused.kernel import CONVEX, LANES  # noqa: E402
-from mjx_refine.sim.fused.simulator import LARGEST, FusedSimulator, packed, plan  # noqa: E402
-from mjx_refine.sim.model import contact_pairs  # noqa: E402
-from mjx_refine.sim.warp import contact_points  # noqa: E402
+from benchmarks.speed_scenes import KINDS, near
+from mjx_refine.effects import batch_with_effects
+from mjx_refine.errors import InputError
+from mjx_refine.scene import Body, Effect, Scene
+from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.sim.fused.kernel import CONVEX, LANES
+from mjx_refine.sim.fused.simulator import LARGEST, FusedSimulator, packed, plan
+from mjx_refine.sim.model import contact_pairs
+from mjx_refine.sim.warp import contact_points
 
 CAMERA = KINDS["sphere"].camera
 BALL, CRATE, DRUM, BRICK = (b for b in KINDS["four mixed"].objects)
