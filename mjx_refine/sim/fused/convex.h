@@ -3,6 +3,12 @@
 
 CUDA_CALLABLE static V towards(V n, V d) { return n.dot(d) < 0.0f ? -n : n; }
 
+// One of 36 directions on the circle through u and w.
+CUDA_CALLABLE static V around(V u, V w, int i) {
+    float angle = (i + 0.5f) * 0.17453293f;
+    return u * cosf(angle) + w * sinf(angle);
+}
+
 CUDA_CALLABLE void keep(int i, V point, bool valid) {
     store(room.point[i], point);
     room.valid[i] = valid;
@@ -140,19 +146,10 @@ CUDA_CALLABLE V rim_direction(const CylinderBox& c, int k, bool& counts) {
     counts = u.square() >= 1e-8f;
     u = u.unit();
     V w = pole.cross(u);
-    float best = 1e30f;
     int index = 0;
-    EACH(i, 36) {
-        float angle = (i + 0.5f) * 0.17453293f;
-        float f = c.overlap(u * cosf(angle) + w * sinf(angle));
-        if (f < best) {
-            best = f;
-            index = i;
-        }
-    }
-    least_of_all(best, index);
+    SAMPLED(index, 36, c.overlap(around(u, w, i)));
     float start = (index + 0.5f) * 0.17453293f;
-    V slope = c.slope(u * cosf(start) + w * sinf(start), k);
+    V slope = c.slope(around(u, w, index), k);
     float angle = refined(start, w.z * w.z, slope.dot(u), slope.dot(w), c.radius);
     return u * cosf(angle) + w * sinf(angle);
 }
@@ -322,19 +319,10 @@ CUDA_CALLABLE static V across(V n, V axis) { return n - axis * n.dot(axis); }
 // The least overlap on the circle around a pole, where the other cylinder's rim touches.
 CUDA_CALLABLE V on_circle(const Cylinders& c, V pole, V axis, float radius, bool of_second) {
     V u = axis.cross(pole).unit(), w = pole.cross(u);
-    float best = 1e30f;
     int index = 0;
-    EACH(i, 36) {
-        float angle = (i + 0.5f) * 0.17453293f;
-        float f = c.overlap(u * cosf(angle) + w * sinf(angle));
-        if (f < best) {
-            best = f;
-            index = i;
-        }
-    }
-    least_of_all(best, index);
+    SAMPLED(index, 36, c.overlap(around(u, w, i)));
     float start = (index + 0.5f) * 0.17453293f, along = w.dot(axis);
-    V n = u * cosf(start) + w * sinf(start);
+    V n = around(u, w, index);
     V slope = (of_second ? c.axis * (c.h2 * sign(n.dot(c.axis))) : V{0, 0, c.h1 * sign(n.z)}) - c.apart;
     float angle = refined(start, along * along, slope.dot(u), slope.dot(w), radius);
     return u * cosf(angle) + w * sinf(angle);
@@ -347,16 +335,8 @@ CUDA_CALLABLE static V fibonacci(int i) {
 
 // Where both touch with a rim: directions.least_smooth.
 CUDA_CALLABLE V on_rims(const Cylinders& c) {
-    float best = 1e30f;
     int index = 0;
-    EACH(i, 160) {
-        float f = c.overlap(towards(fibonacci(i), c.apart));
-        if (f < best) {
-            best = f;
-            index = i;
-        }
-    }
-    least_of_all(best, index);
+    SAMPLED(index, 160, c.overlap(towards(fibonacci(i), c.apart)));
     V n = towards(fibonacci(index), c.apart);
     for (int k = 0; k < 8; k++) {
         V slope = -c.apart, first = n.cross(fabsf(n.x) < 0.7f ? V{1, 0, 0} : V{0, 1, 0}).unit(), second = n.cross(first);

@@ -48,7 +48,7 @@ def _source(bodies: int, spots: int, kinds: frozenset[int]) -> str:
     }
     defined = "\n".join(f"#define {name} {value}" for name, value in numbers.items())
     parts = "\n".join(resources.files("mjx_refine.sim.fused").joinpath(f"{part}.h").read_text() for part in PARTS)
-    undefined = "\n".join(f"#undef {name}" for name in (*numbers, "LANES", "SYNC", "EACH"))
+    undefined = "\n".join(f"#undef {name}" for name in (*numbers, "LANES", "SYNC", "EACH", "SAMPLED"))
     return f"""
 {defined}
 #if defined(__CUDA_ARCH__)
@@ -59,6 +59,14 @@ def _source(bodies: int, spots: int, kinds: frozenset[int]) -> str:
 #define SYNC
 #endif
 #define EACH(i, n) for (int i = lane; i < (n); i += LANES)
+#define SAMPLED(index, n, value) {{ \\
+    float low = 1e30f; \\
+    EACH(i, n) {{ \\
+        float f = value; \\
+        if (f < low) {{ low = f; index = i; }} \\
+    }} \\
+    least_of_all(low, index); \\
+}}
 struct Engine {{
 {parts}
 }};

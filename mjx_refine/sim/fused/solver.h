@@ -171,7 +171,7 @@ CUDA_CALLABLE void residuals(const float* x) {
     SYNC;
 }
 
-// M (x - calm) as pushed; the cost of x.
+// The cost of x.
 CUDA_CALLABLE float cost(const float* x) {
     residuals(x);
     float sum = 0.0f, force[6];

@@ -1,4 +1,4 @@
-// State of one candidate and the lanes that share it. A part of the body of a function: see __init__.py.
+// State of one candidate and the lanes that share it. A part of the body of a structure: see kernel.py.
 //
 // Everything that lanes exchange lies in Room, in a block's shared memory; SYNC stands between writing and reading.
 // Values that all lanes compute from the same numbers are the same in all, so that branches on them never part them.
@@ -75,7 +75,7 @@ struct Room {
     Spot spot[SPOTS];
     Contact contact[CONTACTS];
     float hessian[(DOFS + 1) * (DOFS + 1)];  // the last row holds the right side
-    float calm[DOFS], acc[DOFS], last[DOFS], slope[DOFS], step[DOFS], pushed[DOFS];
+    float calm[DOFS], acc[DOFS], last[DOFS], slope[DOFS], step[DOFS];
     float point[40][3], gap[40];
     int valid[40], extreme[8], chosen[8];
     int line[78], column[78];  // of the entries of a triangle
@@ -94,14 +94,6 @@ CUDA_CALLABLE static float total(float value) {
     for (int o = 16; o; o >>= 1) value += __shfl_xor_sync(0xffffffffu, value, o);
 #endif
     return value;
-}
-
-CUDA_CALLABLE static bool any(bool value) {
-#if defined(__CUDA_ARCH__)
-    return __any_sync(0xffffffffu, value);
-#else
-    return value;
-#endif
 }
 
 // The least value of all lanes and its index, the lower one of two.
