@@ -18,16 +18,15 @@ Nothing is left out for a load of others: the load is printed.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import multiprocessing
 import os
 import platform
 import sys
 import tempfile
-from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from unittest import mock
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 # Linear algebra is small here. To be set before numpy loads.
@@ -100,18 +99,6 @@ def peer_table(arguments: argparse.Namespace, ours: dict) -> None:
         )
 
 
-@contextlib.contextmanager
-def _without_gpu() -> Iterator[None]:
-    """Processes that begin while it lasts leave the GPU, which serves few at once, alone."""
-    before = os.environ.get("JAX_PLATFORMS")
-    os.environ["JAX_PLATFORMS"] = "cpu"
-    yield
-    if before is None:
-        del os.environ["JAX_PLATFORMS"]
-    else:
-        os.environ["JAX_PLATFORMS"] = before
-
-
 def clips_table(arguments: argparse.Namespace) -> None:
     """Prints a row for each number of clips through ``refine_many``."""
     population, iterations = arguments.clip_budget
@@ -127,7 +114,9 @@ def clips_table(arguments: argparse.Namespace) -> None:
         folder, most = Path(temporary), max(arguments.clips)
         wanted = [(folder / f"clip_{i:02d}", names[i % len(names)], i + 1, arguments.size, arguments.frames)
                   for i in range(most)]  # fmt: skip
-        with _without_gpu(), multiprocessing.get_context("spawn").Pool(min(most, cores())) as pool:
+        # The GPU serves few processes at once.
+        on_cpus = mock.patch.dict(os.environ, JAX_PLATFORMS="cpu")
+        with on_cpus, multiprocessing.get_context("spawn").Pool(min(most, cores())) as pool:
             clips = pool.starmap(make_clip, wanted, chunksize=1)
         jobs = [Job(clip / "best32.yaml", clip / "flows.npz") for clip in clips]
         os.environ["MJX_REFINE_CACHE"] = str(folder / "cache")

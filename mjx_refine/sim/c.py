@@ -13,6 +13,7 @@ from mujoco import rollout
 from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting
 from mjx_refine.scene import Shape
+from mjx_refine.sim.buckets import diverged_to_nan
 from mjx_refine.sim.carried import carried
 from mjx_refine.sim.model import IDLE, SUBSTEPS, Edited, build_spec, field_arrays, initial_state, model_fields
 from mjx_refine.sim.stepped import stepped_rollout
@@ -121,10 +122,7 @@ class MujocoSimulator:
         return carried(batch, frames, inner)
 
     def _finished(self, positions: np.ndarray, batch: SceneBatch, frames: int) -> np.ndarray:
-        poses = positions.reshape(len(batch), frames, len(self.shapes), 7)
-        bad = ~np.isfinite(poses).all((2, 3)) | (np.abs(poses[..., :3]) > 1e4).any((2, 3))
-        bad = np.logical_or.accumulate(bad, axis=1)
-        return np.where(bad[:, :, None, None], np.nan, poses)
+        return diverged_to_nan(positions.reshape(len(batch), frames, len(self.shapes), 7))
 
     def contacts(self, batch: SceneBatch, row: int, margin: float = 0.0) -> list[tuple[int, int, float, np.ndarray]]:
         """Contacts of the first frame: (first object, second, distance [m], normal from first to second); -1: floor."""
