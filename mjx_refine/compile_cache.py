@@ -44,13 +44,13 @@ def enable_cache() -> Path | None:
         return None
     try:
         (folder / "jax").mkdir(parents=True, exist_ok=True)
-        (folder / "warp").mkdir(parents=True, exist_ok=True)
+        (folder / "kernels").mkdir(parents=True, exist_ok=True)
     except OSError as error:
         log.warning("%s: no compilation cache (%s); set %s to another folder", folder, error.strerror, VARIABLE)
         return None
     jax.config.update("jax_compilation_cache_dir", str(folder / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
-    _KERNELS["folder"] = str(folder / "warp")
+    _KERNELS.setdefault("folder", str(folder / "kernels"))
     if "warp" in sys.modules:
         keep_kernels(sys.modules["warp"])
     return folder
@@ -58,8 +58,12 @@ def enable_cache() -> Path | None:
 
 def keep_kernels(warp: ModuleType) -> None:
     """Makes Warp, just imported, keep its kernels where ``enable_cache`` said: it is imported by those alone who need it, since
-    that takes seconds."""
-    if "folder" in _KERNELS:
+    that takes seconds.
+
+    Once only, and before its first kernel: Warp then adds its version to the folder, and what is written beside that counts as
+    another version's, of which it warns. A folder that the caller chose stays.
+    """
+    if "folder" in _KERNELS and warp.config.kernel_cache_dir is None:
         warp.config.kernel_cache_dir = _KERNELS["folder"]
 
 

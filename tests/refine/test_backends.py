@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -256,6 +257,24 @@ def test_cache_folder(monkeypatch, tmp_path):
     assert compile_cache.enable_cache() is None
 
 
+ENABLED_AGAIN = """
+from mjx_refine.compile_cache import enable_cache
+enable_cache()
+from mjx_refine.sim.mjx_import import warp
+warp.init()
+enable_cache()
+print(warp.config.kernel_cache_dir)
+"""
+
+
+def test_warp_is_told_where_to_keep_kernels_once(monkeypatch, tmp_path):
+    # Told again, it would keep them beside its version's folder, where the next process takes them for another version's.
+    pytest.importorskip("warp")
+    monkeypatch.setenv(compile_cache.VARIABLE, str(tmp_path))
+    done = subprocess.run([sys.executable, "-c", ENABLED_AGAIN], capture_output=True, text=True, check=True)
+    assert Path(done.stdout.strip()).parent == tmp_path / "kernels"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("row", ["slide", "topple", "bounce-box", "box-box", "box-cylinder", "cylinder-cylinder"])
 def test_mjx_parity(row):
@@ -285,6 +304,7 @@ def test_who_searches_on_the_cores_imports_neither_mjx_nor_warp():
 
 STARTED = """
 import sys
+from pathlib import Path
 from mjx_refine import load_observation, load_scenes, refine
 from mjx_refine.sim.backends import fastest
 print(fastest("auto", 1))
