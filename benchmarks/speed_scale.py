@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.speed_scenes import CAMERA, KINDS, Times, near, timed
-from mjx_refine.batch import concatenate
 from mjx_refine.scene import Scene
 from mjx_refine.search.objective import launched, price_of_overlap
 from mjx_refine.search.options import Options
@@ -22,7 +21,7 @@ from mjx_refine.search.population import PopulationSearch
 from mjx_refine.sim.backends import make_simulator
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.simulate import simulate
-from mjx_refine.space import Space
+from mjx_refine.space import Space, decode_together
 from mjx_refine.view.grid import GridScorer, sampled
 
 WIDTH = 160
@@ -75,7 +74,7 @@ def together(
     for _ in range(count + 1):
         clock = [time.perf_counter()]
         asked = [search.points() for search in searches]
-        batch = concatenate([space.decode(points) for space, points in zip(spaces, asked, strict=True)])
+        batch = decode_together(spaces, asked)
         clock.append(time.perf_counter())
         poses = launched(simulator, batch, frames)()
         prices = np.split(price_of_overlap(reference, batch), clips)

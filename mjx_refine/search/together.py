@@ -12,7 +12,6 @@ from typing import TypeAlias
 import numpy as np
 from mjx_fitness import Scores
 
-from mjx_refine.batch import SceneBatch, concatenate
 from mjx_refine.errors import InputError
 from mjx_refine.search.checkpoint import damaged, load_checkpoint, save_checkpoint
 from mjx_refine.search.objective import launched, price_of_overlap
@@ -21,6 +20,7 @@ from mjx_refine.search.progress import Step
 from mjx_refine.search.ready import Ready, Searched
 from mjx_refine.sim.backends import Simulator
 from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.space import decode_together
 from mjx_refine.view.grid import GridScorer
 
 log = logging.getLogger("mjx_refine")
@@ -106,8 +106,8 @@ class Member:
         return self.before + time.monotonic() - self.began
 
 
-Asked: TypeAlias = tuple[Member, np.ndarray, SceneBatch]
-"""A member, the points that it asks for, and their candidates."""
+Asked: TypeAlias = tuple[Member, np.ndarray]
+"""A member and the points of the unit box that it asks for."""
 
 Ended = Callable[[Member, Exception | None], object]
 """Is told each member whose search has ended; with an error, that it has failed."""
@@ -151,7 +151,7 @@ class Together:
         log.info("%d clips searched in %d generations, %.1f s", count, generations, time.monotonic() - self.began)
 
     def _asked(self) -> list[Asked]:
-        """(member, its points, their candidates) of all that go on; the others leave."""
+        """Members that go on, and their points; the others leave."""
         asked, staying = [], []
         for member in self.members:
             try:
@@ -159,7 +159,7 @@ class Together:
                 if points is None:
                     self._leaves(member)
                     continue
-                asked.append((member, points, member.ready.space.decode(points)))
+                asked.append((member, member.ready.space.checked(points)))
                 staying.append(member)
             except Exception as error:  # one clip's failure is its own
                 self.ended(member, error)
@@ -175,17 +175,17 @@ class Together:
         try:
             told = self._evaluated(part)
         except Exception as error:
-            total = sum(len(points) for _, points, _ in part)
+            total = sum(len(points) for _, points in part)
             if _memory_is_short(error) and total > LEAST and len(part) > 1:
                 self.most = max(LEAST, total // 2)
                 log.warning("%d candidates do not fit in the device's memory; now at most %d at once", total, self.most)
                 for less in _parts(part, self.most):
                     self._generation(less)
                 return
-            for member, _, _ in part:
+            for member, _ in part:
                 self._failed(member, error)
             return
-        for (member, points, _), (costs, scores) in zip(part, told, strict=True):
+        for (member, points), (costs, scores) in zip(part, told, strict=True):
             try:
                 member.told(points, costs, scores)
             except Exception as error:
@@ -197,9 +197,9 @@ class Together:
 
     def _evaluated(self, part: list[Asked]) -> list[tuple[np.ndarray, Scores]]:
         """(costs, scores) of each member's points."""
-        batch = concatenate([candidates for _, _, candidates in part])
+        batch = decode_together([member.ready.space for member, _ in part], [points for _, points in part])
         counts = [0] * len(self.rows)  # those that have left keep their places
-        for member, points, _ in part:
+        for member, points in part:
             counts[self.rows[id(member)]] = len(points)
         with DEVICE:
             poses = launched(self.simulator, batch, self.scorer.length)
@@ -209,7 +209,7 @@ class Together:
             sums = self.scorer.compared(shown, batch, counts)
         scores = self.scorer.scored(sums, counts)
         own = np.split(prices, np.cumsum(counts)[:-1])
-        rows = [self.rows[id(member)] for member, _, _ in part]
+        rows = [self.rows[id(member)] for member, _ in part]
         return [(own[row] - scores[row].fitness, scores[row]) for row in rows]
 
 

@@ -72,3 +72,8 @@ class Parameter:
         transformed = self._transform(self.low) + u * self.span
         value = transformed if self.offset is None else np.exp(transformed) - self.offset
         return np.clip(value, self.low, self.high)
+
+    def put(self, arrays: dict[str, np.ndarray], rows: slice, values: np.ndarray | float) -> None:
+        """Writes ``values`` where ``field`` and ``index`` say, in so many rows."""
+        i, k = self.index
+        arrays[self.field][(rows, k) if i < 0 else (rows, i, k)] = values

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch, batch_from_scenes, scene_from_batch
 from mjx_refine.scene import Scene
-from mjx_refine.space.effects import FIELD, effect_parameters, with_numbers
+from mjx_refine.space.effects import effect_parameters, with_numbers
 from mjx_refine.space.floor import effects_of, levelled, with_effects
-from mjx_refine.space.layout import body_parameters, is_upright, lowest_extent, world_parameters
+from mjx_refine.space.layout import body_parameters, lowest_extent, world_parameters
+from mjx_refine.space.origin import Origin
 from mjx_refine.space.parameter import Parameter
 
 
@@ -92,7 +93,7 @@ class Space:
 
     def values(self, u: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "dimension"]:
         """Physical values at one point of the unit box."""
-        u = self._checked(np.asarray(u, np.float64)[None])[0]
+        u = self.checked(np.asarray(u, np.float64)[None])[0]
         return np.array([p.from_unit(v) for p, v in zip(self.parameters, u, strict=True)])
 
     def scene_at(self, u: Float[np.ndarray, "dimension"]) -> Scene:
@@ -100,7 +101,12 @@ class Space:
         batch = self.decode(np.asarray(u)[None])
         return with_numbers(scene_from_batch(batch, 0, self.scene), batch.effects)
 
-    def _checked(self, u: np.ndarray) -> np.ndarray:
+    def checked(self, u: Float[np.ndarray, "batch dimension"]) -> Float[np.ndarray, "batch dimension"]:
+        """Points of the unit box, rounding errors at its sides cut off.
+
+        Raises:
+          ValueError: wrong shape, not finite, or outside of the box.
+        """
         if u.ndim != 2 or u.shape[1] != self.dimension:
             raise ValueError(f"points have shape {u.shape}; expected (batch, {self.dimension})")
         if not np.isfinite(u).all() or u.min(initial=0.0) < -1e-9 or u.max(initial=1.0) > 1 + 1e-9:
@@ -113,18 +119,7 @@ class Space:
         Raises:
           ValueError: wrong shape, not finite, or outside of the box.
         """
-        u = self._checked(np.asarray(u, np.float64))
-        count = len(u)
-        base = batch_from_scenes([self.scene]).map(lambda a: np.repeat(a, count, 0))
-        raw, effects = self._intermediate(base), effects_of(self.scene, count)
-        # Filled in place, as all of raw is.
-        raw.update({f"{FIELD}{k}": e.values for k, e in enumerate(effects)})
-        columns = zip(self.parameters, self._from_unit(u).T, strict=True)
-        for parameter, value in (*self.held, *columns):
-            i, k = parameter.index
-            target = raw[parameter.field]
-            target[(slice(None), k) if i < 0 else (slice(None), i, k)] = value
-        return with_effects(self._assemble(base, raw), effects)
+        return decode_together([self], [u])
 
     def _from_unit(self, u: Float[np.ndarray, "batch dimension"]) -> Float[np.ndarray, "batch dimension"]:
         """Every parameter's ``from_unit``, all at once."""
@@ -141,67 +136,34 @@ class Space:
         rows = [(p.transformed_low, p.span, o, p.low, p.high) for p, o in zip(self.parameters, offsets, strict=True)]
         return np.array(rows, np.float64).reshape(-1, 5).T
 
-    def _intermediate(self, base: SceneBatch) -> dict[str, np.ndarray]:
-        count, objects = base.mass.shape
-        extent = self._extents(base.size, base.quaternion)
-        strength = np.linalg.norm(base.gravity, axis=-1, keepdims=True)
-        return {
-            "size": base.size.copy(),
-            "position": base.position.copy(),
-            "clearance": (base.position[..., 2] - extent)[..., None],
-            "yaw": np.zeros((count, objects, 1)),
-            "tilt": np.zeros((count, objects, 2)),
-            "lean": np.zeros((count, objects, 1)),
-            "linear_velocity": base.linear_velocity.copy(),
-            "spin": rotations.rotate(base.quaternion, base.angular_velocity),
-            "friction": base.friction.copy(),
-            "resistance": -base.damping[..., None],
-            "mass": base.mass[..., None].copy(),
-            "camera_position": base.camera_position.copy(),
-            "camera_pitch": base.camera_pitch[:, None].copy(),
-            "camera_fovy": base.camera_fovy[:, None].copy(),
-            "gravity": strength,
-        }
-
-    def _extents(self, size: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-        columns = [lowest_extent(s, size[:, i], quaternion[:, i]) for i, s in enumerate(self.scene.shapes)]
-        return np.stack(columns, 1)
-
-    def _assemble(self, base: SceneBatch, raw: dict[str, np.ndarray]) -> SceneBatch:
-        zeros = np.zeros_like(raw["yaw"])
-        vertical = rotations.exponential(np.concatenate([zeros, zeros, raw["yaw"]], -1))
-        lean = raw["lean"] * _lean_axes(self.scene)
-        tilt = rotations.exponential(np.concatenate([raw["tilt"], zeros], -1) + lean)
-        quaternion = rotations.normalise(rotations.multiply(vertical, rotations.multiply(tilt, base.quaternion)))
-        position = raw["position"].copy()
-        position[..., 2] = raw["clearance"][..., 0] + self._extents(raw["size"], quaternion)
-        strength = np.linalg.norm(base.gravity, axis=-1, keepdims=True)
-        return dataclasses.replace(
-            base,
-            size=raw["size"],
-            mass=raw["mass"][..., 0],
-            friction=raw["friction"],
-            damping=-raw["resistance"][..., 0],
-            position=position,
-            quaternion=quaternion,
-            linear_velocity=raw["linear_velocity"],
-            angular_velocity=rotations.rotate(rotations.conjugate(quaternion), raw["spin"]),
-            gravity=base.gravity * (raw["gravity"] / np.where(strength > 0, strength, 1.0)),
-            camera_position=raw["camera_position"],
-            camera_pitch=raw["camera_pitch"][:, 0],
-            camera_fovy=raw["camera_fovy"][:, 0],
-        )
+    @functools.cached_property
+    def _origin(self) -> Origin:
+        """The scene as a batch of one, what is held in place."""
+        origin = Origin.of(self.scene, effects_of(self.scene, 1))
+        for parameter, value in self.held:
+            parameter.put(origin.raw, slice(None), value)
+        return origin
 
 
-def _lean_axes(scene: Scene) -> Float[np.ndarray, "objects 3"]:
-    """For each lying cylinder the horizontal direction across its axis, zero for the others."""
-    axes = np.zeros((len(scene.objects), 3))
-    for i, body in enumerate(scene.objects):
-        if body.shape == "cylinder" and not is_upright(body):
-            axis = rotations.matrix(np.array(body.orientation))[:, 2]
-            across = np.cross([0.0, 0.0, 1.0], axis)
-            axes[i] = across / np.linalg.norm(across)
-    return axes
+def decode_together(spaces: Sequence[Space], points: Sequence[Float[np.ndarray, "_ dimension"]]) -> SceneBatch:
+    """The candidates at points of several unit boxes, one space after the other: one pass over all of them.
+
+    Args:
+      spaces: of scenes with the same shapes and effects.
+      points: of each, as ``Space.decode`` takes them.
+
+    Raises:
+      ValueError: wrong shape, not finite, or outside of the box; or the scenes' kinds differ.
+    """
+    checked = [space.checked(np.asarray(u, np.float64)) for space, u in zip(spaces, points, strict=True)]
+    counts = [len(u) for u in checked]
+    origin = Origin.rows([space._origin for space in spaces], np.repeat(np.arange(len(spaces)), counts))
+    last = np.cumsum(counts)
+    for space, u, end in zip(spaces, checked, last, strict=True):
+        rows = slice(end - len(u), end)
+        for parameter, values in zip(space.parameters, space._from_unit(u).T, strict=True):
+            parameter.put(origin.raw, rows, values)
+    return with_effects(origin.assembled(), origin.effects)
 
 
 def _fixed_of_body(name: str, shape: str, i: int, count: int) -> list[tuple[str, str]]:
