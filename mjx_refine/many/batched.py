@@ -230,7 +230,7 @@ class Batched:
                     self._tell(one.name, error)
             first = group[0].ready
             candidates = sum(member.search.population for member in ready)
-            backend = fastest(self.options.backend, candidates) if ready else self.backend
+            backend = fastest(self.options.backend, candidates, len(first.shapes)) if ready else self.backend
             log.info("%d clips of %s are searched together by %s", len(ready), "+".join(first.shapes), backend)
             if ready:
                 with DEVICE:

@@ -37,7 +37,7 @@ def warm_up(job: Job, count: int, common: Options, simulator: Made) -> None:
         clip = sampled(observation, [-1] * len(scene.shapes), search_resolution(options, observation.size))
         batch = batch_from_scenes([scene] * (count * population))
         with DEVICE:
-            made = simulator(fastest(options.backend, len(batch)), scene.shapes, observation.fps)
+            made = simulator(fastest(options.backend, len(batch), len(batch.shapes)), scene.shapes, observation.fps)
             poses = launched(made, batch, observation.length)()
             GridScorer(scene.shapes, [clip] * count).compared(poses, batch, [population] * count)
     except Exception as error:

@@ -11,10 +11,11 @@ import numpy as np
 from mjx_fitness import Scores
 
 from mjx_refine.effects import batch_with_effects
-from mjx_refine.scene import Scene, Shape
+from mjx_refine.scene import Scene
 from mjx_refine.search.aim import aimed
 from mjx_refine.search.checkpoint import damaged, input_digest, load_checkpoint, save_checkpoint
 from mjx_refine.search.derivatives import DerivativeChoice, Derivatives
+from mjx_refine.search.engines import Engines
 from mjx_refine.search.intervals import Intervals, intervals
 from mjx_refine.search.landed import Landed, first_covariance, landed_well
 from mjx_refine.search.landing import LeastSquares
@@ -27,7 +28,7 @@ from mjx_refine.search.progress import Progress, Step
 from mjx_refine.search.race import OPEN, TRIAL, Contender, Race, second_landing
 from mjx_refine.search.ready import Ready, Searched
 from mjx_refine.search.undetermined import back_to_start, insensitive
-from mjx_refine.sim.backends import Simulator, fastest, make_simulator
+from mjx_refine.sim.backends import Simulator, fastest
 from mjx_refine.sim.devices import has_accelerator, on_device
 from mjx_refine.space import Space
 from mjx_refine.view.effects import needs_pictures
@@ -94,6 +95,7 @@ class Run:
     def __init__(self, problem: Problem, progress: Progress, checkpoint: Path | None, resume: bool):
         self.problem, self.options, self.progress = problem, problem.options, progress
         self.path, self.choice = checkpoint, DerivativeChoice(problem, progress.message)
+        self.engines = Engines(problem)
         self.began = time.monotonic()
         self.digest = input_digest(problem.samples, problem.observation, self.options)
         self.history: list[Step] = []
@@ -185,7 +187,7 @@ class Run:
         columns, image = self.problem.columns(start.matching), self.problem.observation.size
         return LeastSquares(
             space,
-            reference.rollout,
+            self.engines.rollout(start.scene, space.dimension),
             self.problem.seen,
             columns,
             image,
@@ -268,17 +270,12 @@ class Run:
         race = self._race(self._beginnings(first))
         backend = self.problem.backends[kind_of_scene(first.start.given)]
         if backend != "mujoco":
-            backend = fastest(self.options.backend, self.options.population)
-        fps = self.problem.observation.fps
-
-        @functools.cache
-        def simulator(shapes: tuple[Shape, ...]) -> Simulator:
-            return make_simulator(backend, shapes, fps, quick=True)
+            backend = fastest(self.options.backend, self.options.population, len(first.start.scene.shapes))
 
         @functools.cache
         def objective(k: int, fine: bool) -> Objective:
             start, space = race.contenders[k].start, race.contenders[k].space
-            return self._objective(start, space, simulator(space.scene.shapes), fine)
+            return self._objective(start, space, self.engines.quick(backend, space.scene.shapes), fine)
 
         while (turn := race.turn()) is not None:
             k, points = turn
@@ -290,7 +287,7 @@ class Run:
                 self._saved = race.saved()
                 self._save()
         winner = race.contenders[race.winner]
-        return winner, simulator(winner.space.scene.shapes)
+        return winner, self.engines.quick(backend, winner.space.scene.shapes)
 
     # Finish -------------------------------------------------------------------------------------------------------
 

@@ -14,12 +14,16 @@ from mjx_refine.effects import acting
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Shape
 from mjx_refine.sim.carried import refuse_loads
+from mjx_refine.sim.fused import LARGEST
 
 BACKENDS = ("auto", "mjx", "warp", "mujoco")
 
-FEW_A_CORE = 3
-"""Candidates in a batch for each core below which C MuJoCo is as fast as a GPU, where a few candidates take as long as hundreds:
-box and cylinder, 16 cores and an H100: 128 candidates 67 and 11 ms."""
+FEW_A_CORE = 2
+"""Candidates in a batch for each core below which C MuJoCo is as fast as the kernel of whole rollouts, where a few candidates
+take as long as hundreds: box and cylinder, 16 cores and an H100: 128 candidates 67 and 11 ms, one 8 and 9."""
+
+FEW_A_CORE_OF_MANY = 24
+"""The same of MJX-Warp, which simulates more objects than the kernel holds."""
 
 QUICK = (5, 4)
 """Newton and line-search iterations of MJX-Warp for a search: a batch waits for its slowest candidate. 64 candidates against C
@@ -63,8 +67,8 @@ def resolve_backend(name: str) -> str:
     return "mujoco" if problem else "warp"
 
 
-def fastest(name: str, candidates: int) -> str:
-    """The backend that ``name`` means here for so many candidates at once: ``auto`` is mujoco also for few.
+def fastest(name: str, candidates: int, objects: int) -> str:
+    """The backend that ``name`` means here for so many candidates of so many objects at once: ``auto`` is mujoco also for few.
 
     In a process beside the one that has the GPU, warp is mujoco.
 
@@ -74,7 +78,8 @@ def fastest(name: str, candidates: int) -> str:
     resolved = resolve_backend(name)
     if resolved == "warp" == os.environ.get(OFFERED):
         return "mujoco"
-    return "mujoco" if name == "auto" and candidates <= FEW_A_CORE * cores() else resolved
+    few = cores() * (FEW_A_CORE if objects <= LARGEST else FEW_A_CORE_OF_MANY)
+    return "mujoco" if name == "auto" and candidates <= few else resolved
 
 
 def backend_for(name: str, batch: SceneBatch) -> str:
@@ -115,11 +120,10 @@ def make_simulator(name: str, shapes: tuple[Shape, ...], fps: float, quick: bool
 
 def _warp(shapes: tuple[Shape, ...], fps: float, quick: bool) -> Simulator:
     """MJX-Warp, or for searches the kernel that makes all steps of a candidate, where it has room for so many objects."""
-    if quick:
-        from mjx_refine.sim.fused.simulator import LARGEST, FusedSimulator
+    if quick and len(shapes) <= LARGEST:
+        from mjx_refine.sim.fused.simulator import FusedSimulator
 
-        if len(shapes) <= LARGEST:
-            return FusedSimulator(shapes, fps)
+        return FusedSimulator(shapes, fps)
     from mjx_refine.sim.warp import WarpSimulator
 
     return WarpSimulator(shapes, fps, *QUICK) if quick else WarpSimulator(shapes, fps)

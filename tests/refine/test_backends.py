@@ -307,6 +307,6 @@ import sys
 from pathlib import Path
 from mjx_refine import load_observation, load_scenes, refine
 from mjx_refine.sim.backends import fastest
-print(fastest("auto", 1))
+print(fastest("auto", 1, 2))
 print(*[name for name in ("mujoco.mjx", "warp", "scipy.stats", "scipy.optimize") if name in sys.modules])
 """

@@ -14,8 +14,9 @@ from mjx_refine.effects import batch_with_effects
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Body, Effect, Scene
 from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.sim.fused import LARGEST
 from mjx_refine.sim.fused.kernel import CONVEX, LANES
-from mjx_refine.sim.fused.simulator import LARGEST, FusedSimulator, packed, plan
+from mjx_refine.sim.fused.simulator import FusedSimulator, packed, plan
 from mjx_refine.sim.model import contact_pairs
 from mjx_refine.sim.warp import contact_points
 

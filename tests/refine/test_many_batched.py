@@ -24,6 +24,7 @@ from mjx_refine.search.ready import Searched
 from mjx_refine.search.together import Member, Together
 from mjx_refine.sim import backends
 from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.sim.fused import LARGEST
 from mjx_refine.sim.mjx import room
 from mjx_refine.simulate import simulate
 from mjx_refine.space import Space
@@ -306,11 +307,12 @@ def test_batches_take_a_size_that_is_compiled():
 def test_few_candidates_are_for_the_cores(monkeypatch):
     monkeypatch.setattr(backends, "resolve_backend", lambda name: "warp" if name == "auto" else name)
     monkeypatch.setattr(backends, "cores", lambda: 16)
-    assert [backends.fastest("auto", n) for n in (32, 48, 49)] == ["mujoco", "mujoco", "warp"]
-    assert backends.fastest("warp", 1) == "warp"
-    assert backends.fastest("mjx", 1) == "mjx"
+    assert [backends.fastest("auto", n, 2) for n in (16, 32, 33)] == ["mujoco", "mujoco", "warp"]
+    assert [backends.fastest("auto", n, LARGEST + 1) for n in (384, 385)] == ["mujoco", "warp"]
+    assert backends.fastest("warp", 1, 2) == "warp"
+    assert backends.fastest("mjx", 1, 2) == "mjx"
     monkeypatch.setenv(backends.OFFERED, "warp")  # what a worker beside the GPU's process has
-    assert backends.fastest("auto", 385) == "mujoco"
+    assert backends.fastest("auto", 385, 2) == "mujoco"
 
 
 def test_a_scene_with_an_effect_is_refined_by_its_worker_alone(clips, tmp_path):

@@ -7,3 +7,6 @@ The contact points are those of ``mjx_refine.sim.colliders``, the solver is Newt
 single precision. It is for searches, whose results C MuJoCo simulates and scores again. The source is C++, so that it can
 say which lane does what, and the same source runs on a CPU as one lane, for tests.
 """
+
+LARGEST = 8
+"""Objects up to which a candidate's state fits into the shared memory that every block has."""

@@ -20,12 +20,10 @@ from mjx_refine.rotations import rotate
 from mjx_refine.scene import Shape
 from mjx_refine.sim.buckets import Launched, diverged_to_nan, rows_for
 from mjx_refine.sim.carried import carried, refuse_loads
+from mjx_refine.sim.fused import LARGEST
 from mjx_refine.sim.fused.kernel import CONVEX, LANES, kernel
 from mjx_refine.sim.model import SUBSTEPS, contact_pairs, initial_state, model_fields
 from mjx_refine.sim.warp_problem import REMEDY, warp_problem
-
-LARGEST = 8
-"""Objects up to which a candidate's state fits into the shared memory that every block has."""
 
 _SHAPES = {"sphere": 0, "cylinder": 1, "box": 2}
 

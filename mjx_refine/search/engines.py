@@ -1,0 +1,43 @@
+"""What simulates which part of a refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.scene import Scene, Shape
+from mjx_refine.search.problem import Problem
+from mjx_refine.sim.backends import Simulator, fastest, make_simulator
+from mjx_refine.sim.devices import on_device
+from mjx_refine.sim.fused import LARGEST
+
+
+class Engines:
+    """The simulators of one refinement, each made once, since a kernel takes a second to load.
+
+    Args:
+      problem: the clip, its options and C MuJoCo.
+    """
+
+    def __init__(self, problem: Problem):
+        self.problem = problem
+        self._made: dict[tuple[str, tuple[Shape, ...]], Simulator] = {}
+
+    def quick(self, backend: str, shapes: tuple[Shape, ...]) -> Simulator:
+        """A search's, of a backend."""
+        key = backend, shapes
+        if key not in self._made:
+            self._made[key] = make_simulator(backend, shapes, self.problem.observation.fps, quick=True)
+        return self._made[key]
+
+    def rollout(self, scene: Scene, candidates: int) -> Callable[[SceneBatch, int], np.ndarray]:
+        """Least squares', whose Jacobians are so many candidates: C MuJoCo, or where that is faster the kernel of whole rollouts.
+
+        One engine makes all rollouts of a fit: costs of two do not compare.
+        """
+        shapes, name = scene.shapes, self.problem.options.backend
+        if scene.effects or len(shapes) > LARGEST or fastest(name, candidates, len(shapes)) != "warp":
+            return self.problem.reference(shapes).rollout
+        return on_device()(self.quick("warp", shapes).rollout)
