@@ -15,12 +15,15 @@ _DARK, _LIGHT = 84, 112
 
 def largest_flow(observation: Observation) -> float:
     """The flow [px] that gets full colour: the 98 % quantile of the observed foreground's, at least 0.2."""
-    speed = np.linalg.norm(observation.flow, axis=-1)
-    known = np.isfinite(speed)
-    chosen = speed[known & (foreground(observation)[:-1] > 0)]
+    chosen = _speeds(observation.flow[foreground(observation)[:-1] > 0])
     if not chosen.size:
-        chosen = speed[known]
+        chosen = _speeds(observation.flow)
     return max(float(np.quantile(chosen, 0.98)), 0.2) if chosen.size else 1.0
+
+
+def _speeds(flow: Float[np.ndarray, "*pixels 2"]) -> Float[np.ndarray, "measured"]:
+    speed = np.linalg.norm(flow, axis=-1)
+    return speed[np.isfinite(speed)]
 
 
 def flow_picture(
