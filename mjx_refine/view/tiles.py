@@ -30,6 +30,11 @@ CHUNKS = (256, 2048, 8192)
 """Tiles in one kernel call; a batch's tiles go into the largest that fit, so that few sizes are ever compiled."""
 
 
+ROWS = (1, 16, 128)
+"""Candidates in one kernel call, of which the last repeats; beyond these powers of two. So a clip's own numbers of samples,
+elites and parameters ask for no compilation."""
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class _Tiles:
@@ -163,7 +168,8 @@ class TileScorer:
 
     def _sums(self, poses: np.ndarray, batch: SceneBatch) -> Sums:
         count, length = poses.shape[:2]
-        frames = frames_of_batch(poses, batch, self.image[1])
+        more = np.minimum(np.arange(_rows(count)), count - 1)
+        frames = frames_of_batch(poses[more], batch[more], self.image[1])
         frame, tile = self._active(poses, batch)
         totals = np.zeros((6 + 2 * len(self.shapes), count * length))
         start = 0
@@ -215,6 +221,10 @@ def foreground(observation: Observation) -> Int[np.ndarray, "frames height width
     threshold = max(0.5, 5 * float(np.median(speed)))
     moving = (speed > threshold).astype(np.int32)
     return np.concatenate([moving, np.zeros_like(moving[:1])])
+
+
+def _rows(count: int) -> int:
+    return next((rows for rows in ROWS if rows >= count), 1 << (count - 1).bit_length())
 
 
 def _padded(values: np.ndarray, size: int) -> np.ndarray:

@@ -187,7 +187,7 @@ def test_after_a_search_elsewhere_a_run_finishes_without_one(clips, tmp_path, mo
     options = dataclasses.replace(TINY, optimizer="cmaes")
     (member,) = members_of(clips[:1], tmp_path, options)
     Together([member], MujocoSimulator(("sphere",), 30.0, 1), lambda member, error: None).run()
-    monkeypatch.setattr("mjx_refine.search.run.make_simulator", lambda *_, **__: pytest.fail("searched again"))
+    monkeypatch.setattr("mjx_refine.search.engines.make_simulator", lambda *_, **__: pytest.fail("searched again"))
     outcome = work(jobs_of(clips[:1])[0], tmp_path, options)
     assert outcome.status == "done"
     assert outcome.evaluations == 48

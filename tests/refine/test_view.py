@@ -16,6 +16,7 @@ from mjx_refine.batch import SceneBatch, batch_from_scenes
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Body, Camera, Scene
 from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.view import tiles
 from mjx_refine.view.frames import frames_of_batch
 from mjx_refine.view.outline import directions, supports
 from mjx_refine.view.picture import draw
@@ -287,6 +288,21 @@ def test_a_candidates_score_does_not_depend_on_its_company():
     scorer = TileScorer(batch.shapes, clip, (4, 9, 2))
     together = scorer(poses, batch).fitness
     np.testing.assert_allclose(together[7:9], scorer(poses[7:9], batch[7:9]).fitness, rtol=0, atol=1e-6)
+
+
+def test_other_numbers_of_candidates_compile_nothing():
+    clip, batch = observed(), candidates(1, 6)
+    poses = MujocoSimulator(batch.shapes, 30.0, 1).rollout(batch, FRAMES)
+    scorer = TileScorer(batch.shapes, clip, (4, 9, 2))
+
+    def compiled(count: int) -> int:
+        rows = np.zeros(count, int)
+        scorer(poses[rows], batch[rows])
+        return tiles._chunk._cache_size()
+
+    compiled(1)
+    many = compiled(9)
+    assert [compiled(count) for count in (2, 5, 14, 16)] == [many] * 4
 
 
 @pytest.mark.parametrize(("resolution", "bound"), [((120, 80), 0.03), ((61, 43), 0.06), ((1000, 1000), 1e-5)])
