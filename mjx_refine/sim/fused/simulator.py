@@ -116,6 +116,18 @@ class FusedSimulator:
 
         For scenes without effects that act on motion. What has diverged is not marked.
         """
+        begun = self._begun(batch, frames)
+
+        def finished() -> Float[Array, "rows frames objects 7"]:
+            poses = self._waited(begun)
+            kept = jax.block_until_ready(jnp.array(jax.dlpack.from_dlpack(poses), copy=True))
+            begun.clear()
+            return kept.reshape(-1, frames, len(self.shapes), 7)
+
+        return finished
+
+    def _begun(self, batch: SceneBatch, frames: int) -> list[Any]:
+        """Begins a rollout: (the poses to be, what it reads). No other may have their memory before it has ended."""
         if batch.shapes != self.shapes:
             raise ValueError(f"scene kind {batch.shapes}; this simulator was made for {self.shapes}")
         rows = rows_for(len(batch), self._sizes)
@@ -130,16 +142,13 @@ class FusedSimulator:
         if self._stream is not None:
             self._stream.wait_stream(self._on.stream)
         wp.launch(made, rows * self._lanes, inputs=inputs, device=self._on, stream=self._stream, block_dim=self._lanes)
+        return [poses, device]
 
-        def finished() -> Float[Array, "rows frames objects 7"]:
-            if self._stream is not None:
-                wp.synchronize_stream(self._stream)
-            kept = jax.block_until_ready(jnp.array(jax.dlpack.from_dlpack(poses), copy=True))
-            # Its memory is not given to another rollout before that.
-            del inputs[:]
-            return kept.reshape(rows, frames, len(self.shapes), 7)
-
-        return finished
+    def _waited(self, begun: list[Any]) -> Any:
+        """The poses of a rollout, once it has ended, as an array of Warp's."""
+        if self._stream is not None:
+            wp.synchronize_stream(self._stream)
+        return begun[0]
 
     def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
         """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged.
@@ -164,4 +173,5 @@ class FusedSimulator:
         return WarpSimulator(self.shapes, self.fps, any_device=not self._on.is_cuda)
 
     def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
-        return diverged_to_nan(np.asarray(self.launch(batch, frames)(), np.float64)[: len(batch)])
+        poses = self._waited(self._begun(batch, frames)).numpy().reshape(-1, frames, len(self.shapes), 7)
+        return diverged_to_nan(poses[: len(batch)].astype(np.float64))
