@@ -34,11 +34,25 @@ def write_atomic(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -
     Raises:
       InputError: the place cannot be written.
     """
-    path = Path(path)
+    path = replaceable(path)
     with _replacing(path) as temporary, open(temporary, "wb") as stream:
         write(stream)
         stream.flush()
         os.fsync(stream.fileno())
+    return path
+
+
+def replaceable(path: str | os.PathLike) -> Path:
+    """Where a file called ``path`` is to be written: what a link leads to.
+
+    Raises:
+      InputError: there is something else than a file, such as a device or a pipe.
+    """
+    path = Path(path)
+    if path.is_symlink():
+        path = Path(os.path.realpath(path))
+    if os.path.lexists(path) and not path.is_file() and not path.is_dir():
+        raise InputError(f"{path}: is no plain file; expected a file to replace, or nothing; choose another name")
     return path
 
 
@@ -99,4 +113,5 @@ def writable_file(path: str | os.PathLike) -> Path:
         raise InputError(f"{path}: there is no directory {path.parent}; make it or name another --out")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise InputError(f"{path}: no permission to write in {path.parent}; name another --out")
+    replaceable(path)
     return path

@@ -103,6 +103,8 @@ def _check_keys(path: Path, keys: list[str], known: Sequence[str], needed: Seque
 def check_sizes(path: Path) -> None:
     """Refuses headers that promise more than memory holds, before anything is read."""
     try:
+        if path.is_dir():
+            raise InputError(f"{path}: is a directory; expected an observation (npz with flow, masks, fps)")
         if not path.is_file():
             raise InputError(f"{path}: no such file; expected an observation (npz with flow, masks, fps)")
         with zipfile.ZipFile(path) as archive:
@@ -222,7 +224,7 @@ def _sigma(sigma: np.ndarray, shape: tuple[int, ...], source: str) -> float | np
         raise InputError(f"{source}: flow_sigma is {sigma.dtype} {sigma.shape}; expected one number or shape {shape}")
     if not (sigma[np.isfinite(sigma)] >= 0).all() or not np.isfinite(sigma).any():
         raise InputError(f"{source}: flow_sigma holds negative or no finite numbers; expected pixels >= 0")
-    if (sigma[np.isfinite(sigma)] > MAX_FLOW).any():
+    if (sigma[np.isfinite(sigma)].astype(np.float64) > MAX_FLOW).any():
         raise InputError(
             f"{source}: flow_sigma holds {sigma[np.isfinite(sigma)].max():.3g}; expected at most {MAX_FLOW:g}"
         )

@@ -33,6 +33,7 @@ LAYERS = (
     {"many"},
     {"__init__"},
     {"cli"},
+    {"__main__"},
 )
 # Which of the other two packages a part may import; they import nothing of ours.
 BORDERS = {"search": {"mjx_cmaes", "mjx_fitness"}, "view": {"mjx_fitness"}, "evaluate": {"mjx_fitness"}, "guess": {"mjx_fitness"},

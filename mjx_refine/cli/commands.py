@@ -106,7 +106,7 @@ def _refine(init: Path, video: Path, out: Path, resume: bool, options: dict) -> 
 
     # Importing JAX takes seconds; bad input is told before.
     from mjx_refine.cli.display import display
-    from mjx_refine.report import write_result
+    from mjx_refine.report import warnings, write_result
     from mjx_refine.search import Options, refine
 
     remove_stale_parts(out)
@@ -124,6 +124,8 @@ def _refine(init: Path, video: Path, out: Path, resume: bool, options: dict) -> 
         f"{after.first_frame_iou[0]:.3f}, EPE {before.epe[0]:.3f} -> {after.epe[0]:.3f} px, "
         f"{result.seconds['total']:.0f} s ({result.backend}); {out}/report.html"
     )
+    for warning in warnings(result, observation):
+        click.echo(f"refine: {warning}", err=True)
 
 
 @contextlib.contextmanager

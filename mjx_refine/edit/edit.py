@@ -99,7 +99,11 @@ def understood(clause: str, scene: Scene, last: tuple[str, ...] = ()) -> Step:
         if step is not None:
             return step
     near = "; ".join(f'"{form}"' for form in nearest_forms(words))
-    raise NotUnderstoodError(f"instruction {cut(clause, 80)!r} is not understood; expected such as {near}; rephrase it")
+    # Where no object was recognised, what was meant may not be there.
+    there = "" if "@" in words else f"; the scene's objects are {cut(', '.join(scene.names), 200)}"
+    raise NotUnderstoodError(
+        f"instruction {cut(clause, 80)!r} is not understood; expected such as {near}{there}; rephrase it"
+    )
 
 
 def nearest_forms(words: str, count: int = 3) -> list[str]:

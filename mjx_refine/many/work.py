@@ -15,7 +15,7 @@ from mjx_refine.files import remove_stale_parts
 from mjx_refine.many.jobs import Job
 from mjx_refine.many.outcome import BAD_INPUT, DONE, FAILED, SKIPPED, Outcome, outcome_of, result_of
 from mjx_refine.observation import Observation, load_observation
-from mjx_refine.report import write_result
+from mjx_refine.report import warnings, write_result
 from mjx_refine.scene import Samples, load_scenes
 from mjx_refine.search import Options, Progress, Step, refine
 from mjx_refine.search.checkpoint import input_digest, load_checkpoint
@@ -140,7 +140,8 @@ def _ended(job: Job, folder: Path, options: Options, opened: _Opened, told: Call
         problem=_KEPT.pop(opened.digest, None),
     )
     write_result(folder, result, opened.observation)
-    return outcome_of(job.name, DONE, folder, "; ".join(opened.notes))
+    notes = [*opened.notes, *warnings(result, opened.observation)]
+    return outcome_of(job.name, DONE, folder, "; ".join(notes))
 
 
 def _prepared(job: Job, folder: Path, options: Options, told: Callable[[float], object]) -> Outcome | Prepared:

@@ -11,6 +11,7 @@ import numpy as np
 from mjx_fitness import UNMATCHED
 
 from mjx_refine.observation import Observation
+from mjx_refine.report.doubts import warnings
 from mjx_refine.search.intervals import CONFIDENCE
 from mjx_refine.search.result import ParameterRow, RefineResult, Replay
 
@@ -46,6 +47,7 @@ def result_numbers(result: RefineResult, observation: Observation) -> dict[str, 
         "undetermined": [row.name for row in result.parameters if not row.determined],
         "fixed": [{"name": name, "reason": reason} for name, reason in result.fixed],
         "problems": [{"index": problem.index, "reason": problem.reason} for problem in result.problems],
+        "warnings": warnings(result, observation),
         "clip": {"frames": observation.length, "fps": observation.fps, "size": list(observation.size)},
         "options": dataclasses.asdict(result.options),
         "digest": result.digest,

@@ -14,11 +14,9 @@ from mjx_refine.observation import Observation
 from mjx_refine.report import encode, plots, tables
 from mjx_refine.report.animation import overlay_gif
 from mjx_refine.report.contours import Overlay, fitted
+from mjx_refine.report.doubts import warnings
 from mjx_refine.report.flow_picture import error_picture, flow_picture, heat_bar, largest_flow, wheel
 from mjx_refine.search.result import RefineResult
-
-POOR = 0.7
-"""IoU below which the page warns."""
 
 FRAMES, INTERVALS = 6, 3
 _FRAME_SIDE, _FLOW_SIDE = 640, 480  # px
@@ -45,7 +43,7 @@ def report_page(result: RefineResult, observation: Observation, animation: bytes
         clip=observation,
         source=Path(observation.source).name,
         sentence=sentence(result),
-        warnings=warnings(result),
+        warnings=warnings(result, observation),
         notes=notes(result, observation),
         scores=_tiles(result),
         animation=encode.data_uri("image/gif", _small_enough(result, observation, animation)),
@@ -102,32 +100,6 @@ def trust(result: RefineResult) -> str:
     return f"{kind} of this clip's simulation can be trusted where least squares ended: {told.reason}."
 
 
-def warnings(result: RefineResult) -> list[str]:
-    """What should keep a reader from trusting the result."""
-    before, after = result.init.scores, result.refined.scores
-    found = []
-    iou = float(after.iou[0])
-    if iou < POOR:
-        found.append(
-            f"The result is poor: IoU {iou:.2f} is below {POOR}. Look at the frames below for what does not fit: a wrong "
-            "shape, number of objects or mask, or something that the model lacks. More iterations or samples may help."
-        )
-    if float(after.first_frame_iou[0]) < float(before.first_frame_iou[0]) - 0.01:
-        found.append(
-            f"The first frame fits worse than before: IoU {float(before.first_frame_iou[0]):.3f} became "
-            f"{float(after.first_frame_iou[0]):.3f}."
-        )
-    if not np.isfinite(result.refined.poses).all():
-        first = int(np.argmax(~np.isfinite(result.refined.poses).all((1, 2))))
-        found.append(f"The simulation diverges at frame {first}.")
-    lost = [name for name, mask in zip(result.scene.names, result.matching, strict=True) if mask == UNMATCHED]
-    if lost:
-        found.append(
-            f"No mask was left for {', '.join(lost)}: nothing in the clip holds {'it' if len(lost) == 1 else 'them'}."
-        )
-    return found
-
-
 def notes(result: RefineResult, observation: Observation) -> list[str]:
     """What a reader should know."""
     found = []
@@ -144,9 +116,6 @@ def notes(result: RefineResult, observation: Observation) -> list[str]:
     if result.problems:
         listed = "; ".join(f"{problem.index}: {problem.reason}" for problem in result.problems)
         found.append(f"{len(result.problems)} of the samples could not be read ({listed}).")
-    unseen = sorted(set(observation.mask_ids()) - set(result.matching))
-    if unseen:
-        found.append(f"Masks without an object: {', '.join(map(str, unseen))}.")
     if observation.masks is None:
         found.append("The clip has no masks: the moving region of the flow stands for them.")
     return found

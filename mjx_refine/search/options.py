@@ -74,6 +74,8 @@ class Options:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
                 raise InputError(f"{name} = {value!r}; expected a whole number, {low} <= {name} <= {high}")
+        if not isinstance(self.weights, Weights):
+            raise InputError(f"weights = {self.weights!r}; expected mjx_fitness.Weights")
         if self.resolution is not None and (len(self.resolution) != 2 or min(self.resolution) < 8):
             raise InputError(f"resolution = {self.resolution!r}; expected (width, height) of at least 8 x 8")
 

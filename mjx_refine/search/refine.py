@@ -28,6 +28,7 @@ from mjx_refine.view.effects import draw_effects, needs_pictures
 CHECKPOINT = "checkpoint.npz"
 UNDETERMINED = "one prior width changes the fitness by less than 0.002; kept at its start"
 
+UNASKED = "no refits were made, which would tell"
 _COMPILE = {"seconds": 0.0}
 
 
@@ -69,6 +70,9 @@ def refine(
     Source: CMA-ES on IoU - EPE from the best of 32 samples: Δynamics (CVPR 2026).
     """
     options = options or Options()
+    if not isinstance(observation, Observation):
+        told = type(observation).__name__
+        raise InputError(f"observation: is a {told}; expected an Observation; read one with load_observation(path)")
     began, compiled = time.monotonic(), _COMPILE["seconds"]
     samples = _as_samples(samples)
     enable_cache()
@@ -148,6 +152,7 @@ def _rows(found: Found) -> tuple[ParameterRow, ...]:
             low = min(float(p.from_unit(found.known.low[j])), value)
             high = max(float(p.from_unit(found.known.high[j])), value)
             note = note or _doubt(found.known, j)
+        note = note or ("" if found.known is not None else UNASKED)
         rows.append(ParameterRow(p.name, p.unit, given[p.name], value, low, high, not note, note))
     return tuple(rows)
 

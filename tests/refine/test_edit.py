@@ -253,6 +253,14 @@ def test_odd_names_are_named_in_quotation_marks():
         edit(text, "double the mass of @1")
 
 
+def test_who_names_no_object_is_told_their_names():
+    with pytest.raises(
+        NotUnderstoodError,
+        match=r"is not understood; expected such as .*; the scene's objects are box_0, sphere_0, can",
+    ):
+        edit(TEXT, "make cube_3 twice as heavy")
+
+
 VOCABULARY = """
 make set reduce double copy remove move launch spin turn zoom tilt raise lower scale reverse stop use the a as of to by at
 about and ; , . its it box_0 can ball everything camera gravity mass speed x-velocity size radius height friction bounce

@@ -11,7 +11,7 @@ from benchmarks.bad_cases import scene_text
 from benchmarks.interrupt import Call, check_file, check_folder, interrupt
 from mjx_refine.cli.main import run
 from mjx_refine.errors import InputError
-from mjx_refine.files import remove_stale_parts, write_atomic, write_text
+from mjx_refine.files import remove_stale_parts, writable_file, write_atomic, write_text
 
 BROKEN = (ValueError, OSError, EOFError, zipfile.BadZipFile)
 TINY = ["--population", "8", "--iterations", "6", "--seed", "3", "--refits", "2"]
@@ -87,6 +87,19 @@ def test_killed_and_resumed_gives_the_same(folder, tmp_path):
     call = Call(folder / "init.yaml", folder / "clip.npz", 8, 6)
     report = interrupt(call, tmp_path, kills=2, seed=1)
     assert report.kills == 2
+
+
+def test_what_a_link_leads_to_is_replaced_and_what_is_no_file_is_not(tmp_path):
+    target = write_text(tmp_path / "target.txt", "old")
+    (tmp_path / "link").symlink_to(target)
+    write_text(tmp_path / "link", "new")
+    assert target.read_text() == "new"
+    assert (tmp_path / "link").is_symlink()
+    os.mkfifo(tmp_path / "pipe")
+    for write in (lambda path: write_text(path, "new"), writable_file):
+        with pytest.raises(InputError, match=r"pipe: is no plain file; expected .*; choose another name"):
+            write(tmp_path / "pipe")
+    assert (tmp_path / "pipe").is_fifo()
 
 
 def test_a_write_that_fails_leaves_the_old_file_alone(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import dataclasses
 import io
@@ -16,7 +17,7 @@ from PIL import Image
 
 from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation, make_observation
-from mjx_refine.report import write_result
+from mjx_refine.report import encode, warnings, write_result
 from mjx_refine.report.contours import Overlay, colour, pale
 from mjx_refine.report.flow_picture import error_picture, flow_picture, largest_flow
 from mjx_refine.report.numbers import plain
@@ -344,3 +345,26 @@ def test_a_place_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="file"):
         write_result(tmp_path / "file" / "out", made_up(), seen())
+
+
+def test_pictures_of_noise_are_written():
+    noise = np.random.default_rng(0).integers(0, 256, (320, 480, 3), np.uint8)
+    head, data = encode.jpeg(noise).split(",")
+    assert head == "data:image/jpeg;base64"
+    with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+        assert (image.format, image.size) == ("JPEG", (480, 320))
+        assert np.abs(np.asarray(image).astype(float) - noise).mean() < 20
+    red = np.zeros((16, 16, 3), np.uint8)
+    red[..., 0] = 255
+    with Image.open(io.BytesIO(base64.b64decode(encode.jpeg(red).split(",")[1]))) as image:
+        np.testing.assert_allclose(np.asarray(image), red, atol=3)
+
+
+def test_what_was_not_measured_or_matched_is_warned_of(tmp_path):
+    unmeasured = make_observation(np.full_like(flow(1.0), np.nan), 30.0, masks(0), source="clip.npz")
+    said = "The clip's flow is measured nowhere", "No mask was left for ball", "Masks without an object: 2"
+    found = warnings(made_up(), unmeasured)
+    assert all(any(line.startswith(words) for line in found) for words in said)
+    write_result(tmp_path, made_up(), unmeasured)
+    assert json.loads((tmp_path / "result.json").read_text())["warnings"] == found
+    assert not any(line.startswith(said[0]) for line in warnings(made_up(), seen()))

@@ -16,7 +16,7 @@ from mjx_refine.scene.write import dump_scene
 from mjx_refine.search import OPTIMIZERS, Options, Progress, RefineResult, Step, refine
 from mjx_refine.search import run as run_module
 from mjx_refine.search.checkpoint import load_checkpoint, save_checkpoint
-from mjx_refine.search.refine import CHECKPOINT
+from mjx_refine.search.refine import CHECKPOINT, UNASKED, UNDETERMINED
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.space import Space
 from mjx_refine.view.picture import draw
@@ -47,6 +47,19 @@ def clip() -> Observation:
 
 
 SAMPLES = [perturbed(seed) for seed in range(3)]
+
+
+def test_without_refits_nothing_says_that_the_clip_determines_a_parameter(clip):
+    result = refine(SAMPLES[0], clip, TINY)
+    assert not any(row.determined for row in result.parameters)
+    assert {row.note for row in result.parameters} <= {UNASKED, UNDETERMINED}
+
+
+def test_a_path_or_plain_weights_are_refused():
+    with pytest.raises(InputError, match=r"is a str; expected an Observation; read one with load_observation"):
+        refine(SAMPLES[0], "one.npz", TINY)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"expected mjx_fitness\.Weights"):
+        Options(weights={"iou": 1.0})  # type: ignore[arg-type]
 
 
 def history_of(result: RefineResult) -> list[Step]:
