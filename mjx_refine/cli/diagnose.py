@@ -83,6 +83,8 @@ def diagnose(context: click.Context, init, video, poses, out: Path, seed: int, w
     finally:
         steps.close()
     click.echo(f"{diagnosis.verdict.sentence} (probability {diagnosis.verdict.probability:.2f}); {out}/report.html")
+    for note in diagnosis.notes:
+        click.echo(f"refine: {note}", err=True)
 
 
 def _check_call(context: click.Context, init: Sequence[Path], video: Sequence[Path], poses: Sequence[Path]) -> None:
@@ -239,7 +241,6 @@ def _diagnosed(inputs: Inputs, call: dict[str, Any], without, seed: int, threads
         scenes.append(scene)
         taken.append(index)
         if note:
-            click.echo(f"refine: {note}", err=True)
             notes.append(note)
     if notes:
         call = {**call, "sample": taken}

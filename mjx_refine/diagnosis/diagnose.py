@@ -327,6 +327,10 @@ def _notes(clip: ClipFit, compared: Compared, matching, names) -> tuple[str, ...
     lost = [n for n, i in zip(names, matching, strict=True) if i < 0]
     if lost:
         notes.append(f"No mask belongs to {', '.join(lost)}: nothing is known of it.")
+    if not np.isfinite(clip.measured.flow).any():
+        notes.append(
+            "No flow of an object was measured: what only flow shows, such as the spin of a ball, is not known."
+        )
     if clip.misfit(compared.base) > 10 and best_candidate(compared) is None:
         notes.append("The base model's fit is far off; a better starting scene may change the answer.")
     if compared.impacts:

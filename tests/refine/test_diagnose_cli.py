@@ -76,7 +76,7 @@ def test_a_good_call(folder, asked, capsys):
     assert run([*CALL, "--seed", "7", "--without", "magnus", "--without", "wind", "--without", "magnus"]) == 0
     out, err = capsys.readouterr()
     assert out == "sphere_0 is slowed by the air. (probability 0.93); out/report.html\n"
-    assert err == ""
+    assert err == "refine: a note\n"
     ((scene, observation, options),) = asked
     assert scene == load_scene("scene.yaml")
     assert np.array_equal(observation.masks, load_observation("flows.npz").masks)
