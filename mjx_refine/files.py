@@ -34,12 +34,11 @@ def write_atomic(path: str | os.PathLike, write: Callable[[BinaryIO], object]) -
     Raises:
       InputError: the place cannot be written.
     """
-    path = replaceable(path)
-    with _replacing(path) as temporary, open(temporary, "wb") as stream:
+    with _replacing(replaceable(path)) as temporary, open(temporary, "wb") as stream:
         write(stream)
         stream.flush()
         os.fsync(stream.fileno())
-    return path
+    return Path(path)
 
 
 def replaceable(path: str | os.PathLike) -> Path:

@@ -21,7 +21,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.generate.options import FRAMES, SIZE
 from mjx_refine.generate.tiles import GRID, HIGH, WIDE
 from mjx_refine.scene import SHAPES, Shape
-from mjx_refine.view.frames import Frames, make_frames
+from mjx_refine.view.frames import Frames, compiled_frames
 from mjx_refine.view.rays import cast
 
 CAPACITY = 48
@@ -204,10 +204,7 @@ def _frames(qpos: np.ndarray, batch: SceneBatch, row: int) -> Frames:
     """``frames_of_batch``, which takes thrice as long, since it gives JAX one array after another."""
     one = slice(row, row + 1)
     arrays = (qpos[None], batch.size[one], batch.camera_position[one], batch.camera_pitch[one], batch.camera_fovy[one])
-    return _make_frames(*(array.astype(np.float32) for array in arrays), SIZE[1])
-
-
-_make_frames = jax.jit(make_frames, static_argnums=5)
+    return compiled_frames(*(array.astype(np.float32) for array in arrays), SIZE[1])
 
 
 @functools.cache

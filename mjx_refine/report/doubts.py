@@ -19,7 +19,7 @@ def warnings(result: RefineResult, observation: Observation) -> list[str]:
     iou = float(after.iou[0])
     if iou < POOR:
         found.append(
-            f"The result is poor: IoU {iou:.2f} is below {POOR}. Look at the frames below for what does not fit: a wrong "
+            f"The result is poor: IoU {iou:.2f} is below {POOR}. Look at the frames in the report for what does not fit: a wrong "
             "shape, number of objects or mask, or something that the model lacks. More iterations or samples may help."
         )
     if float(after.first_frame_iou[0]) < float(before.first_frame_iou[0]) - 0.01:

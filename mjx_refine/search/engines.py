@@ -15,7 +15,7 @@ from mjx_refine.sim.fused import LARGEST
 
 
 class Engines:
-    """The simulators of one refinement, each made once, since a kernel takes a second to load.
+    """The simulators of one refinement, each made once.
 
     Args:
       problem: the clip, its options and C MuJoCo.

@@ -20,7 +20,8 @@ BACKENDS = ("auto", "mjx", "warp", "mujoco")
 
 FEW_A_CORE = 2
 """Candidates in a batch for each core below which C MuJoCo is as fast as the kernel of whole rollouts, where a few candidates
-take as long as hundreds: box and cylinder, 16 cores and an H100: 128 candidates 67 and 11 ms, one 8 and 9."""
+take as long as hundreds: box and cylinder, 16 cores and an H100: 128 candidates, eight on each core, 67 and 11 ms; the kernel
+takes 9 for one."""
 
 FEW_A_CORE_OF_MANY = 24
 """The same of MJX-Warp, which simulates more objects than the kernel holds."""

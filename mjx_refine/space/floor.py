@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from mjx_refine.batch import BatchEffect, SceneBatch, scene_from_batch
+from mjx_refine.batch import scene_from_batch
 from mjx_refine.effects import acting
 from mjx_refine.scene import Scene
 
@@ -29,16 +29,3 @@ def tilted(scene: Scene) -> Scene:
     """The inverse of ``levelled``."""
     batch = acting.batch_with_effects([scene])
     return scene if acting.floor_rotation(batch) is None else scene_from_batch(acting.on_the_floor(batch), 0, scene)
-
-
-def effects_of(scene: Scene, count: int) -> tuple[BatchEffect, ...]:
-    """The effects of a scene, for so many candidates."""
-    if not scene.effects:
-        return ()
-    one = acting.batch_with_effects([scene])
-    return tuple(dataclasses.replace(e, values=np.repeat(e.values, count, 0)) for e in one.effects)
-
-
-def with_effects(batch: SceneBatch, effects: tuple[BatchEffect, ...]) -> SceneBatch:
-    """``batch``, made on a level floor, with effects, on the floor that they make."""
-    return acting.on_the_floor(dataclasses.replace(batch, effects=effects)) if effects else batch

@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mjx_refine import rotations
-from mjx_refine.batch import BatchEffect, SceneBatch, batch_from_scenes, concatenate
+from mjx_refine.batch import SceneBatch, concatenate
+from mjx_refine.effects.acting import batch_with_effects, on_the_floor
 from mjx_refine.scene import Scene, Shape
 from mjx_refine.space.effects import FIELD
-from mjx_refine.space.layout import is_upright, lowest_extent
+from mjx_refine.space.layout import STRONGEST, is_upright, lowest_extent
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,39 +21,35 @@ class Origin:
     """Scenes on a level floor, by the quantities that parameters stand for.
 
     Attributes:
-      batch: the scenes.
-      raw: field of a parameter -> array whose rows are scenes, to be written to.
+      batch: the scenes with their effects.
+      raw: field of a parameter -> array whose rows are scenes, to be written to; those of effects are ``batch``'s own.
       lean: for each lying cylinder the horizontal direction across its axis, zero for the others.
-      effects: of the scenes; their numbers are those in ``raw``.
     """
 
     batch: SceneBatch
     raw: dict[str, Float[np.ndarray, "batch ..."]]
     lean: Float[np.ndarray, "batch objects 3"]
-    effects: tuple[BatchEffect, ...]
 
     @classmethod
-    def of(cls, scene: Scene, effects: tuple[BatchEffect, ...]) -> Origin:
-        """One scene, with its effects' numbers (batch 1)."""
-        batch = batch_from_scenes([scene])
-        raw = _quantities(batch)
-        raw.update({f"{FIELD}{k}": effect.values for k, effect in enumerate(effects)})
-        return cls(batch, raw, _lean_axes(scene)[None], effects)
+    def of(cls, scene: Scene) -> Origin:
+        """One scene (batch 1).
+
+        Raises:
+          InputError: an effect is wrong.
+        """
+        batch = batch_with_effects([scene])
+        return cls(batch, {**_quantities(batch), **_numbers_of_effects(batch)}, _lean_axes(scene)[None])
 
     @classmethod
     def rows(cls, origins: Sequence[Origin], rows: Int[np.ndarray, "batch"]) -> Origin:
         """Copies of ``rows`` of all origins together."""
-        raw = {name: np.concatenate([o.raw[name] for o in origins])[rows] for name in origins[0].raw}
-        effects = tuple(
-            dataclasses.replace(effect, values=raw[f"{FIELD}{k}"]) for k, effect in enumerate(origins[0].effects)
-        )
-        # Effects apart: their numbers are in raw already.
-        batch = concatenate([dataclasses.replace(o.batch, effects=o.effects) for o in origins])
-        batch = dataclasses.replace(batch, effects=())[rows]
-        return cls(batch, raw, np.concatenate([o.lean for o in origins])[rows], effects)
+        batch = concatenate([origin.batch for origin in origins])[rows]
+        raw = {name: np.concatenate([origin.raw[name] for origin in origins])[rows] for name in origins[0].raw}
+        lean = np.concatenate([origin.lean for origin in origins])[rows]
+        return cls(batch, {**raw, **_numbers_of_effects(batch)}, lean)
 
     def assembled(self) -> SceneBatch:
-        """The scenes that ``raw`` stands for, without effects."""
+        """The scenes that ``raw`` stands for, on the floor that their effects make."""
         base, raw = self.batch, self.raw
         zeros = np.zeros_like(raw["yaw"])
         vertical = rotations.exponential(np.concatenate([zeros, zeros, raw["yaw"]], -1))
@@ -62,7 +59,8 @@ class Origin:
         position = raw["position"].copy()
         position[..., 2] = raw["clearance"][..., 0] + _extents(base.shapes, raw["size"], quaternion)
         strength = np.linalg.norm(base.gravity, axis=-1, keepdims=True)
-        return dataclasses.replace(
+        gravity = base.gravity * (raw["gravity"] / np.where(strength > 0, strength, 1.0))
+        level = dataclasses.replace(
             base,
             size=raw["size"],
             mass=raw["mass"][..., 0],
@@ -72,11 +70,16 @@ class Origin:
             quaternion=quaternion,
             linear_velocity=raw["linear_velocity"],
             angular_velocity=rotations.rotate(rotations.conjugate(quaternion), raw["spin"]),
-            gravity=base.gravity * (raw["gravity"] / np.where(strength > 0, strength, 1.0)),
+            gravity=np.clip(gravity, -STRONGEST, STRONGEST),  # of a scene at that limit, rounding may exceed it
             camera_position=raw["camera_position"],
             camera_pitch=raw["camera_pitch"][:, 0],
             camera_fovy=raw["camera_fovy"][:, 0],
         )
+        return on_the_floor(level) if level.effects else level
+
+
+def _numbers_of_effects(batch: SceneBatch) -> dict[str, np.ndarray]:
+    return {f"{FIELD}{k}": effect.values for k, effect in enumerate(batch.effects)}
 
 
 def _quantities(base: SceneBatch) -> dict[str, np.ndarray]:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from mjx_refine.batch import SceneBatch, batch_from_scenes, scene_from_batch
 from mjx_refine.scene import Scene
 from mjx_refine.space.effects import effect_parameters, with_numbers
-from mjx_refine.space.floor import effects_of, levelled, with_effects
+from mjx_refine.space.floor import levelled
 from mjx_refine.space.layout import body_parameters, lowest_extent, world_parameters
 from mjx_refine.space.origin import Origin
 from mjx_refine.space.parameter import Parameter
@@ -139,7 +139,7 @@ class Space:
     @functools.cached_property
     def _origin(self) -> Origin:
         """The scene as a batch of one, what is held in place."""
-        origin = Origin.of(self.scene, effects_of(self.scene, 1))
+        origin = Origin.of(self.scene)
         for parameter, value in self.held:
             parameter.put(origin.raw, slice(None), value)
         return origin
@@ -163,7 +163,7 @@ def decode_together(spaces: Sequence[Space], points: Sequence[Float[np.ndarray, 
         rows = slice(end - len(u), end)
         for parameter, values in zip(space.parameters, space._from_unit(u).T, strict=True):
             parameter.put(origin.raw, rows, values)
-    return with_effects(origin.assembled(), origin.effects)
+    return origin.assembled()
 
 
 def _fixed_of_body(name: str, shape: str, i: int, count: int) -> list[tuple[str, str]]:

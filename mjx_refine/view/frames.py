@@ -110,7 +110,7 @@ def frames_of_batch(
 ) -> Frames:
     """``make_frames`` with the camera and sizes of ``batch``, in float32."""
     arrays = (poses, batch.size, batch.camera_position, batch.camera_pitch, batch.camera_fovy)
-    return _make_frames(*(a if isinstance(a, jax.Array) else np.asarray(a, np.float32) for a in arrays), height_px)
+    return compiled_frames(*(a if isinstance(a, jax.Array) else np.asarray(a, np.float32) for a in arrays), height_px)
 
 
-_make_frames = jax.jit(make_frames, static_argnums=5)
+compiled_frames = jax.jit(make_frames, static_argnums=5)

@@ -19,8 +19,8 @@ from mjx_fitness import UNMATCHED, Scores, Sums, Weights, scores_from_sums
 from mjx_refine.batch import SceneBatch
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Shape
-from mjx_refine.view.frames import Frames, frames_of_batch
-from mjx_refine.view.outline import supports
+from mjx_refine.view.frames import Frames, compiled_frames
+from mjx_refine.view.outline import padded, supports
 from mjx_refine.view.rays import cast
 
 SIDE = 8
@@ -29,10 +29,9 @@ SIDE = 8
 CHUNKS = (256, 2048, 8192)
 """Tiles in one kernel call; a batch's tiles go into the largest that fit, so that few sizes are ever compiled."""
 
-
 ROWS = (1, 16, 128)
-"""Candidates in one kernel call, of which the last repeats; beyond these powers of two. So a clip's own numbers of samples,
-elites and parameters ask for no compilation."""
+"""Candidates that it chooses from (``outline.padded``): a clip's own numbers of samples, elites and parameters ask for no
+compilation."""
 
 
 @jax.tree_util.register_dataclass
@@ -168,8 +167,7 @@ class TileScorer:
 
     def _sums(self, poses: np.ndarray, batch: SceneBatch) -> Sums:
         count, length = poses.shape[:2]
-        more = np.minimum(np.arange(_rows(count)), count - 1)
-        frames = frames_of_batch(poses[more], batch[more], self.image[1])
+        frames = compiled_frames(*padded(poses, batch, ROWS), self.image[1])
         frame, tile = self._active(poses, batch)
         totals = np.zeros((6 + 2 * len(self.shapes), count * length))
         start = 0
@@ -221,10 +219,6 @@ def foreground(observation: Observation) -> Int[np.ndarray, "frames height width
     threshold = max(0.5, 5 * float(np.median(speed)))
     moving = (speed > threshold).astype(np.int32)
     return np.concatenate([moving, np.zeros_like(moving[:1])])
-
-
-def _rows(count: int) -> int:
-    return next((rows for rows in ROWS if rows >= count), 1 << (count - 1).bit_length())
 
 
 def _padded(values: np.ndarray, size: int) -> np.ndarray:

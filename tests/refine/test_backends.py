@@ -304,7 +304,6 @@ def test_who_searches_on_the_cores_imports_neither_mjx_nor_warp():
 
 STARTED = """
 import sys
-from pathlib import Path
 from mjx_refine import load_observation, load_scenes, refine
 from mjx_refine.sim.backends import fastest
 print(fastest("auto", 1, 2))

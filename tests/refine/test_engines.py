@@ -25,7 +25,7 @@ SPHERE = KINDS["sphere"]
 
 @pytest.fixture
 def gpu(monkeypatch):
-    """As if the device were a GPU: the rollouts of every kernel that was asked for, by scene kind."""
+    """As if the device were a GPU: sizes of the batches that the kernel was asked for."""
     asked: list[int] = []
 
     class Counted(FusedSimulator):

@@ -190,8 +190,14 @@ def test_every_point_around_every_readable_scene_is_a_scene(raw, seed):
     check_physical(space, np.concatenate([space.start[None], points_of(space, seed)]))
 
 
+AT_THE_LIMIT = dataclasses.replace(
+    Scene((body("sphere", clearance=0.0),), CAMERA), gravity=(76.0, 1000.0, 723.103023958465)
+)
+
+
 @settings(max_examples=40)
 @given(entries(), st.integers(0, 2**32))
+@example(scene_entries(AT_THE_LIMIT), 0)
 def test_what_a_search_returns_can_be_written_and_read_again(raw, seed):
     for entry in raw:
         # Heights and spins mix with sizes and turns; their ranges are not the point here.

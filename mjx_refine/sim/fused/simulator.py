@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -116,18 +117,16 @@ class FusedSimulator:
 
         For scenes without effects that act on motion. What has diverged is not marked.
         """
-        begun = self._begun(batch, frames)
+        waited = self._begun(batch, frames)
 
         def finished() -> Float[Array, "rows frames objects 7"]:
-            poses = self._waited(begun)
-            kept = jax.block_until_ready(jnp.array(jax.dlpack.from_dlpack(poses), copy=True))
-            begun.clear()
+            kept = jax.block_until_ready(jnp.array(jax.dlpack.from_dlpack(waited()), copy=True))
             return kept.reshape(-1, frames, len(self.shapes), 7)
 
         return finished
 
-    def _begun(self, batch: SceneBatch, frames: int) -> list[Any]:
-        """Begins a rollout: (the poses to be, what it reads). No other may have their memory before it has ended."""
+    def _begun(self, batch: SceneBatch, frames: int) -> Callable[[], Any]:
+        """Begins a rollout; what is returned waits for it and gives the poses, an array of Warp's, flat."""
         if batch.shapes != self.shapes:
             raise ValueError(f"scene kind {batch.shapes}; this simulator was made for {self.shapes}")
         rows = rows_for(len(batch), self._sizes)
@@ -142,13 +141,15 @@ class FusedSimulator:
         if self._stream is not None:
             self._stream.wait_stream(self._on.stream)
         wp.launch(made, rows * self._lanes, inputs=inputs, device=self._on, stream=self._stream, block_dim=self._lanes)
-        return [poses, device]
 
-    def _waited(self, begun: list[Any]) -> Any:
-        """The poses of a rollout, once it has ended, as an array of Warp's."""
-        if self._stream is not None:
-            wp.synchronize_stream(self._stream)
-        return begun[0]
+        def waited() -> Any:
+            if self._stream is not None:
+                wp.synchronize_stream(self._stream)
+            # What the kernel reads is not given to another rollout before that.
+            del inputs[:]
+            return poses
+
+        return waited
 
     def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
         """Poses (position [m], quaternion wxyz) at the start of every frame; NaN from where a candidate diverged.
@@ -173,5 +174,5 @@ class FusedSimulator:
         return WarpSimulator(self.shapes, self.fps, any_device=not self._on.is_cuda)
 
     def _rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
-        poses = self._waited(self._begun(batch, frames)).numpy().reshape(-1, frames, len(self.shapes), 7)
+        poses = self._begun(batch, frames)().numpy().reshape(-1, frames, len(self.shapes), 7)
         return diverged_to_nan(poses[: len(batch)].astype(np.float64))
