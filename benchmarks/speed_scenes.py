@@ -48,10 +48,9 @@ class Times:
         return float(np.median(self.seconds))
 
     def __str__(self) -> str:
-        """Median and quartiles, in ms, or in s from 10 s on."""
-        scale, digits = (1.0, 1) if self.median >= 10 else (1e3, 1)
-        low, middle, high = (scale * q for q in np.quantile(self.seconds, (0.25, 0.5, 0.75)))
-        return f"{middle:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
+        """Median and quartiles [ms]."""
+        low, middle, high = (1e3 * q for q in np.quantile(self.seconds, (0.25, 0.5, 0.75)))
+        return f"{middle:.1f} [{low:.1f}, {high:.1f}]"
 
 
 def timed(function: Callable[[], object]) -> float:
