@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import lzma
 import os
 import warnings
@@ -58,7 +59,11 @@ class Observation:
 
     def mask_ids(self) -> list[int]:
         """The instance ids that occur, ascending."""
-        return [] if self.masks is None else [int(i) for i in np.unique(self.masks) if i != 0]
+        return list(self._mask_ids)
+
+    @functools.cached_property
+    def _mask_ids(self) -> tuple[int, ...]:
+        return () if self.masks is None else tuple(int(i) for i in np.unique(self.masks) if i != 0)
 
 
 def load_observation(path: str | os.PathLike) -> Observation:

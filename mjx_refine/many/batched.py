@@ -134,7 +134,8 @@ class Batched:
                 self._give(worker, "prepare", self.to_land.popleft(), self.to_land)
             elif self.to_finish:
                 own = [name for name in self.to_finish if self.home.get(name) is worker]
-                name = own[0] if own else self.to_finish[0]
+                # What takes longest first, so that workers end together.
+                name = max(own or self.to_finish, key=lambda name: _weight(self.kinds[name]))
                 self.to_finish.remove(name)
                 self._give(worker, "refine", name, self.to_finish)
 

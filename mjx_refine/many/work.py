@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import importlib
+import sys
 import time
 import traceback
 from collections.abc import Callable
@@ -15,7 +18,6 @@ from mjx_refine.files import remove_stale_parts
 from mjx_refine.many.jobs import Job
 from mjx_refine.many.outcome import BAD_INPUT, DONE, FAILED, SKIPPED, Outcome, outcome_of, result_of
 from mjx_refine.observation import Observation, load_observation
-from mjx_refine.report import warnings, write_result
 from mjx_refine.scene import Samples, load_scenes
 from mjx_refine.search import Options, Progress, Step, refine
 from mjx_refine.search.checkpoint import input_digest, load_checkpoint
@@ -119,7 +121,29 @@ def _opened(job: Job, folder: Path, options: Options) -> _Opened | Outcome:
 _KEPT: dict[str, Problem] = {}
 """Problems of jobs that were prepared here, for their ends, by digest."""
 
+_AHEAD: dict[str, Run] = {}
+"""Runs of those of them for which something can be done ahead."""
+
 MOST_KEPT = 8
+
+REPORT = "mjx_refine.report"
+
+
+def ahead() -> bool:
+    """Does a piece of what the ends of prepared jobs need and their searches do not change; False where nothing is left."""
+    if not _KEPT:
+        return False
+    if REPORT not in sys.modules:
+        importlib.import_module(REPORT)
+        return True
+    while _AHEAD:
+        digest = next(iter(_AHEAD))
+        run = _AHEAD.pop(digest)
+        if digest in _KEPT:
+            with contextlib.suppress(Exception):  # whoever ends the job says it
+                run.ahead()
+            return True
+    return False
 
 
 def _refined(job: Job, folder: Path, options: Options, told: Callable[[float], object]) -> Outcome:
@@ -139,6 +163,9 @@ def _ended(job: Job, folder: Path, options: Options, opened: _Opened, told: Call
         resume=opened.resume,
         problem=_KEPT.pop(opened.digest, None),
     )
+    # Matplotlib takes a while to import, which clips that wait for a device should not.
+    from mjx_refine.report import warnings, write_result
+
     write_result(folder, result, opened.observation)
     notes = [*opened.notes, *warnings(result, opened.observation)]
     return outcome_of(job.name, DONE, folder, "; ".join(notes))
@@ -151,13 +178,15 @@ def _prepared(job: Job, folder: Path, options: Options, told: Callable[[float], 
     enable_cache()
     problem = Problem(opened.samples, opened.observation, options)
     folder.mkdir(parents=True, exist_ok=True)
-    ready = Run(problem, _Told(told), folder / CHECKPOINT, opened.resume).ready()
+    run = Run(problem, _Told(told), folder / CHECKPOINT, opened.resume)
+    ready = run.ready()
     while len(_KEPT) >= MOST_KEPT:
         _KEPT.pop(next(iter(_KEPT)))
     _KEPT[opened.digest] = problem
     if ready is None:
         here = dataclasses.replace(opened, resume=(folder / CHECKPOINT).exists())
         return _ended(job, folder, options, here, told)
+    _AHEAD[opened.digest] = run
     return Prepared(job.name, ready, opened.digest)
 
 

@@ -18,9 +18,12 @@ from mjx_refine.children import ONE_THREAD, cores, exit_with_parent, inherited
 from mjx_refine.errors import InputError
 from mjx_refine.many.groups import Kind
 from mjx_refine.many.jobs import Job
-from mjx_refine.many.work import prepare, work
+from mjx_refine.many.work import ahead, prepare, work
 from mjx_refine.search import Options
 from mjx_refine.sim.backends import OFFERED, resolve_backend
+
+IDLE = 0.05
+"""Seconds without a task after which a worker does something ahead."""
 
 MOST_FALSE_STARTS = 3
 """Workers that may end before they are ready, since the last that was."""
@@ -102,5 +105,7 @@ def _serve(pipe: Any, out: Path, options: Options, elsewhere: str | None) -> Non
         except InputError:
             pipe.send(("ready", options.backend))  # every job says why it cannot run
         while True:
+            while not pipe.poll(IDLE) and ahead():
+                pass
             task, job = pipe.recv()
             pipe.send(("done", TASKS[task](job, out, options, lambda part: pipe.send(("part", part)))))

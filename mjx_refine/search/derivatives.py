@@ -130,6 +130,12 @@ class DerivativeChoice:
 
     def judge(self, start: Start, space: Space, point: Float[np.ndarray, "dimension"]) -> Derivatives:
         """Whether derivatives at ``point`` tell what is around it; automatic ones only if they were asked for."""
+        key = ("derivatives", start.index, point.tobytes())
+        if key not in self.problem.kept:
+            self.problem.kept[key] = self._judged(start, space, point)
+        return self.problem.kept[key]
+
+    def _judged(self, start: Start, space: Space, point: Float[np.ndarray, "dimension"]) -> Derivatives:
         length, simulator = (
             self.problem.observation.length,
             cast("MujocoSimulator", self.problem.as_seen(start.scene.shapes)),

@@ -37,7 +37,11 @@ class Engines:
 
         One engine makes all rollouts of a fit: costs of two do not compare.
         """
+        if not self.on_device(scene, candidates):
+            return self.problem.reference(scene.shapes).rollout
+        return on_device()(self.quick("warp", scene.shapes).rollout)
+
+    def on_device(self, scene: Scene, candidates: int) -> bool:
+        """Whether a GPU makes these rollouts: it then also tells what is seen of them."""
         shapes, name = scene.shapes, self.problem.options.backend
-        if scene.effects or len(shapes) > LARGEST or fastest(name, candidates, len(shapes)) != "warp":
-            return self.problem.reference(shapes).rollout
-        return on_device()(self.quick("warp", shapes).rollout)
+        return not scene.effects and len(shapes) <= LARGEST and fastest(name, candidates, len(shapes)) == "warp"

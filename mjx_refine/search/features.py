@@ -130,3 +130,15 @@ def flow_points(
             pixels[t, j] = np.stack([columns + 0.5, rows + 0.5], -1)
             seen[t, j] = flow[t, rows, columns]
     return pixels, seen
+
+
+def flow_of_objects(
+    flow: tuple[np.ndarray, np.ndarray] | None, columns: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Pixels and flow of each object's mask; flow is NaN for an object without one."""
+    if flow is None:
+        return np.zeros(0), None
+    pixels, seen = flow
+    chosen = [max(j, 0) for j in columns]
+    lost = np.array([j < 0 for j in columns])
+    return pixels[:, chosen], np.where(lost[None, :, None, None], np.nan, seen[:, chosen])

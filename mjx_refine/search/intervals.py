@@ -19,7 +19,6 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy import special
 
 from mjx_refine.search.landing import LeastSquares, slowed
 from mjx_refine.search.noise import DRAWS, TREMBLE, Noise, measured, unmeasured
@@ -270,6 +269,8 @@ def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refi
       refits: how many, at least 1.
       seed: of their starts.
     """
+    from scipy import special  # takes a third of a second to import
+
     before = squares.evaluations
     posterior = _Posterior(squares)
     space, sigma = squares.space, squares.space.sigma

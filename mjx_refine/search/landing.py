@@ -9,6 +9,7 @@ means anything.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from jaxtyping import Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.search.course import Course, Landing
-from mjx_refine.search.features import DIRECTIONS, POINTS, Outlines
+from mjx_refine.search.features import DIRECTIONS, POINTS, Outlines, flow_of_objects
 from mjx_refine.search.schedule import Stage
 from mjx_refine.space import Space
 from mjx_refine.view.seen import seen_point_flow, seen_supports
@@ -75,6 +76,7 @@ class LeastSquares:
       solver: what runs inside a stage: ``lm``, ours, or one of ``solvers``.
       automatic: derivatives where it has some; None: differences alone.
       fps: frames a second, for effects.
+      looking: entered where JAX tells what is seen of a rollout: its device.
     """
 
     def __init__(
@@ -90,7 +92,9 @@ class LeastSquares:
         solver: str = "lm",
         automatic: Automatic | None = None,
         fps: float = 30.0,
+        looking: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext,
     ):
+        self.looking = looking
         self.limit, self.seed, self.solver, self.automatic = limit, seed, solver, automatic
         self.space, self.rollout, self.image, self.fps = space, rollout, image, fps
         self.pixel = image[0] / 480.0
@@ -99,7 +103,7 @@ class LeastSquares:
             if j >= 0:
                 target[:, n] = seen.support[:, j]
         self.target = target
-        self.pixels, self.flow = _of_objects(flow, columns)
+        self.pixels, self.flow = flow_of_objects(flow, columns)
         self.spent = 0.0
 
     def distances(self, points: np.ndarray, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -113,11 +117,13 @@ class LeastSquares:
         # The outlines of all frames, so that one length is compiled; those beyond the horizon repeat its last.
         beyond = np.repeat(poses[:, -1:], len(self.target) - frames, axis=1)
         poses = np.concatenate([poses, beyond], 1)
-        seen = seen_supports(poses, batch, self.image, DIRECTIONS, self.fps)
+        with_flow = self.flow is not None and frames > 1
+        with self.looking():
+            seen = seen_supports(poses, batch, self.image, DIRECTIONS, self.fps)
+            moved = seen_point_flow(poses, batch, self.pixels, self.image, self.fps) if with_flow else None
         reach = seen[:, :frames] - self.target[:frames]
         flow = np.full((len(points), frames, len(batch.shapes), 0), np.nan)
-        if self.flow is not None and frames > 1:
-            moved = seen_point_flow(poses, batch, self.pixels, self.image, self.fps)
+        if moved is not None:
             moved = moved[:, :frames] - self.flow[:frames]
             moved[:, frames - 1] = np.nan
             flow = moved.reshape(*moved.shape[:3], -1)
@@ -388,13 +394,3 @@ class LeastSquares:
 def slowed(raw: Float[np.ndarray, "*shape"], scale: float | np.ndarray) -> Float[np.ndarray, "*shape"]:
     """Residuals whose squares are Cauchy's loss: as they are below ``scale``, growing ever more slowly beyond."""
     return np.sign(raw) * scale * np.sqrt(np.log1p((raw / scale) ** 2))
-
-
-def _of_objects(flow, columns: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Pixels and flow of each object's mask; flow is NaN for an object without one."""
-    if flow is None:
-        return np.zeros(0), None
-    pixels, seen = flow
-    chosen = [max(j, 0) for j in columns]
-    lost = np.array([j < 0 for j in columns])
-    return pixels[:, chosen], np.where(lost[None, :, None, None], np.nan, seen[:, chosen])

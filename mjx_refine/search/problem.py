@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import defaultdict
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -59,6 +60,9 @@ class Problem:
       observation: the clip.
       options: weights, threads.
 
+    Attributes:
+      kept: what was found out about it, for whoever asks again.
+
     Raises:
       InputError: an effect of a scene is wrong, or the backend cannot carry it.
     """
@@ -67,6 +71,7 @@ class Problem:
         self.samples, self.observation, self.options = samples, observation, options
         self._simulators: dict[tuple[Shape, ...], MujocoSimulator] = {}
         self._scorers: dict[tuple, TileScorer | PictureScorer] = {}
+        self.kept: dict[tuple, Any] = {}
         self.backends = _backends(samples, options.backend)
         masks = foreground(observation)
         self.seen: Outlines = outlines(masks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import time
@@ -195,6 +196,7 @@ class Run:
             seed=self.options.seed,
             solver=self.options.solver,
             fps=reference.fps,
+            looking=on_device if self.engines.on_device(start.scene, space.dimension) else contextlib.nullcontext,
         )
 
     def _beginning(self) -> Beginning:
@@ -247,6 +249,12 @@ class Run:
             landed=landed_well(self.landed),
             checkpoint=self.path,
         )
+
+    def ahead(self) -> None:
+        """After ``ready``, what the finish needs and the search does not change: derivatives where it begins, kept by the
+        problem."""
+        first = self._beginning()
+        self.choice.judge(first.start, first.space, first.mean)
 
     def _race(self, beginnings: list[Beginning]) -> Race:
         """The search from each, or what is saved of it."""

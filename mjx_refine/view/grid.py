@@ -181,7 +181,7 @@ class GridScorer:
         seen_from[: len(batch)] = np.column_stack(columns)
         if len(poses) < room:
             poses = np.concatenate([poses, np.zeros((room - len(poses), *poses.shape[1:]), np.float32)])
-        shown = jnp.asarray(poses, jnp.float32), jnp.asarray(seen_from)
+        shown = jnp.asarray(poses, jnp.float32), seen_from
         static = (self.shapes, self.image, self.moving_only, layout.chunk)
         return _compared(*static, *shown, layout.row, layout.clip, self._clips)
 

@@ -54,5 +54,5 @@ def point_flow(
 
     Where the ray misses the object, that of a point fixed to it beside its outline; zero in the last frame.
     """
-    where = jnp.asarray(np.asarray(pixels, np.float32))
+    where = np.asarray(pixels, np.float32)
     return in_pieces(lambda arrays: _point_flow(batch.shapes, arrays, where, image), poses, batch)

@@ -14,7 +14,7 @@ from own_clip import FLIGHT, SLIDE, perturbed
 from mjx_refine.batch import batch_from_scenes
 from mjx_refine.many import Job, refine_many
 from mjx_refine.many.warm import warm_up
-from mjx_refine.many.work import RESULTS, Prepared, prepare, work
+from mjx_refine.many.work import RESULTS, Prepared, ahead, prepare, work
 from mjx_refine.observation import load_observation, save_observation
 from mjx_refine.scene import Effect, Scene, load_scenes, save_scenes
 from mjx_refine.search import Options
@@ -192,6 +192,25 @@ def test_after_a_search_elsewhere_a_run_finishes_without_one(clips, tmp_path, mo
     assert outcome.status == "done"
     assert outcome.evaluations == 48
     assert load_scenes(tmp_path / "a/refined.yaml")
+
+
+def test_what_a_search_does_not_change_is_done_while_it_runs(clips, tmp_path, monkeypatch):
+    """Each piece once; and the end is what it would have been, without judging derivatives again."""
+    options = dataclasses.replace(TINY, optimizer="cmaes")
+    ends = []
+    for early in (False, True):
+        while ahead():  # what other tests left
+            pass
+        (member,) = members_of(clips[:1], tmp_path / str(early), options)
+        if early:
+            assert ahead()
+            assert not ahead()
+            monkeypatch.setattr("mjx_refine.search.derivatives.check", lambda *_, **__: pytest.fail("judged again"))
+        Together([member], MujocoSimulator(("sphere",), 30.0, 1), lambda member, error: None).run()
+        assert work(jobs_of(clips[:1])[0], tmp_path / str(early), options).status == "done"
+        ends.append(json.loads((tmp_path / str(early) / "a/result.json").read_text()))
+    assert ends[0]["derivatives"] == ends[1]["derivatives"]
+    assert ends[0]["refined"] == ends[1]["refined"]
 
 
 @pytest.mark.parametrize("masks", [True, False])
