@@ -8,10 +8,13 @@ import numpy as np
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.scene import Scene, Shape
+from mjx_refine.search.features import POINTS
 from mjx_refine.search.problem import Problem
 from mjx_refine.sim.backends import Simulator, fastest, make_simulator
 from mjx_refine.sim.devices import on_device
 from mjx_refine.sim.fused import LARGEST
+from mjx_refine.view.at_once import reach_and_flow
+from mjx_refine.view.seen import Look, seen_reach_and_flow
 
 
 class Engines:
@@ -41,7 +44,25 @@ class Engines:
             return self.problem.reference(scene.shapes).rollout
         return on_device()(self.quick("warp", scene.shapes).rollout)
 
+    def look(self, scene: Scene, candidates: int) -> Look:
+        """What tells least squares what is seen of these rollouts: whoever makes them."""
+        return on_device()(_at_once) if self.on_device(scene, candidates) else seen_reach_and_flow
+
     def on_device(self, scene: Scene, candidates: int) -> bool:
-        """Whether a GPU makes these rollouts: it then also tells what is seen of them."""
+        """Whether a GPU makes these rollouts."""
         shapes, name = scene.shapes, self.problem.options.backend
         return not scene.effects and len(shapes) <= LARGEST and fastest(name, candidates, len(shapes)) == "warp"
+
+
+def _at_once(
+    poses: np.ndarray,
+    batch: SceneBatch,
+    pixels: np.ndarray | None,
+    image: tuple[int, int],
+    count: int,
+    fps: float,
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """``seen_reach_and_flow`` of scenes without effects, in one program: a flow that nobody asks for costs nothing beside."""
+    somewhere = np.zeros((*poses.shape[1:3], POINTS, 2)) if pixels is None else pixels
+    reach, flow = reach_and_flow(poses, batch, somewhere, image, count)
+    return reach, None if pixels is None else flow

@@ -9,7 +9,6 @@ means anything.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,7 @@ from mjx_refine.search.course import Course, Landing
 from mjx_refine.search.features import DIRECTIONS, POINTS, Outlines, flow_of_objects
 from mjx_refine.search.schedule import Stage
 from mjx_refine.space import Space
-from mjx_refine.view.seen import seen_point_flow, seen_supports
+from mjx_refine.view.seen import Look, seen_reach_and_flow
 
 if TYPE_CHECKING:
     from mjx_refine.search.derivatives import Automatic
@@ -76,7 +75,7 @@ class LeastSquares:
       solver: what runs inside a stage: ``lm``, ours, or one of ``solvers``.
       automatic: derivatives where it has some; None: differences alone.
       fps: frames a second, for effects.
-      looking: entered where JAX tells what is seen of a rollout: its device.
+      look: tells reach and flow, as ``seen_reach_and_flow`` does.
     """
 
     def __init__(
@@ -92,9 +91,9 @@ class LeastSquares:
         solver: str = "lm",
         automatic: Automatic | None = None,
         fps: float = 30.0,
-        looking: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext,
+        look: Look = seen_reach_and_flow,
     ):
-        self.looking = looking
+        self.look = look
         self.limit, self.seed, self.solver, self.automatic = limit, seed, solver, automatic
         self.space, self.rollout, self.image, self.fps = space, rollout, image, fps
         self.pixel = image[0] / 480.0
@@ -117,13 +116,11 @@ class LeastSquares:
         # The outlines of all frames, so that one length is compiled; those beyond the horizon repeat its last.
         beyond = np.repeat(poses[:, -1:], len(self.target) - frames, axis=1)
         poses = np.concatenate([poses, beyond], 1)
-        with_flow = self.flow is not None and frames > 1
-        with self.looking():
-            seen = seen_supports(poses, batch, self.image, DIRECTIONS, self.fps)
-            moved = seen_point_flow(poses, batch, self.pixels, self.image, self.fps) if with_flow else None
+        pixels = self.pixels if self.flow is not None and frames > 1 else None
+        seen, moved = self.look(poses, batch, pixels, self.image, DIRECTIONS, self.fps)
         reach = seen[:, :frames] - self.target[:frames]
         flow = np.full((len(points), frames, len(batch.shapes), 0), np.nan)
-        if moved is not None:
+        if moved is not None and self.flow is not None:
             moved = moved[:, :frames] - self.flow[:frames]
             moved[:, frames - 1] = np.nan
             flow = moved.reshape(*moved.shape[:3], -1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import time
@@ -13,7 +12,6 @@ from mjx_fitness import Scores
 
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.scene import Scene
-from mjx_refine.search.aim import aimed
 from mjx_refine.search.checkpoint import damaged, input_digest, load_checkpoint, save_checkpoint
 from mjx_refine.search.derivatives import DerivativeChoice, Derivatives
 from mjx_refine.search.engines import Engines
@@ -22,6 +20,7 @@ from mjx_refine.search.landed import Landed, first_covariance, landed_well
 from mjx_refine.search.landing import LeastSquares
 from mjx_refine.search.landings import Landings
 from mjx_refine.search.objective import Objective
+from mjx_refine.search.objectives import Objectives
 from mjx_refine.search.options import search_resolution
 from mjx_refine.search.population import PopulationSearch
 from mjx_refine.search.problem import Problem, Start, kind_of_scene
@@ -30,10 +29,9 @@ from mjx_refine.search.race import OPEN, TRIAL, Contender, Race, second_landing
 from mjx_refine.search.ready import Ready, Searched
 from mjx_refine.search.undetermined import back_to_start, insensitive
 from mjx_refine.sim.backends import Simulator, fastest
-from mjx_refine.sim.devices import has_accelerator, on_device
+from mjx_refine.sim.devices import on_device
 from mjx_refine.space import Space
-from mjx_refine.view.effects import needs_pictures
-from mjx_refine.view.grid import GridScorer, sampled
+from mjx_refine.view.grid import sampled
 
 LANDING_SHARE = 0.6
 """Part of the budget that least squares may spend before the population search (``hybrid``)."""
@@ -97,6 +95,7 @@ class Run:
         self.problem, self.options, self.progress = problem, problem.options, progress
         self.path, self.choice = checkpoint, DerivativeChoice(problem, progress.message)
         self.engines = Engines(problem)
+        self.objectives = Objectives(problem, self.engines)
         self.began = time.monotonic()
         self.digest = input_digest(problem.samples, problem.observation, self.options)
         self.history: list[Step] = []
@@ -140,7 +139,7 @@ class Run:
         derivatives = self.choice.final(start, space, winner.mean)
         elites = [winner.mean, *found]
         return Found(
-            **self._finish(start, space, elites, self._objective(start, space)),
+            **self._finish(start, space, elites, self.objectives.of(start, space)),
             derivatives=derivatives,
             history=tuple(self.history),
             evaluations=self.evaluations,
@@ -150,23 +149,6 @@ class Run:
             searched=where.seconds,
         )
 
-    @property
-    def _finer(self) -> bool:
-        """Whether the search ends at a finer resolution: not at a user's own, nor on a device, which would compile anew."""
-        hybrid = self.options.optimizer == "hybrid" and self.options.resolution is None
-        return hybrid and not has_accelerator()
-
-    def _objective(self, start: Start, space: Space, simulator=None, fine: bool = False) -> Objective:
-        reference, size = self.problem.reference(start.scene.shapes), self.problem.observation.size
-        pictures = needs_pictures(batch_with_effects([start.scene]))
-        if simulator is not None and not pictures and has_accelerator():
-            clip = sampled(self.problem.observation, start.matching, search_resolution(self.options, size))
-            grid = GridScorer(start.scene.shapes, [clip], [self.options.weights])
-            return Objective(space, simulator, reference, grid)
-        resolution = search_resolution(self.options, size, fine)
-        scorer = self.problem.scorer(start.scene.shapes, start.matching, resolution, pictures)
-        return Objective(space, simulator or reference, reference, scorer)
-
     # Land ---------------------------------------------------------------------------------------------------------
 
     def _land(self) -> None:
@@ -175,7 +157,7 @@ class Run:
 
     def _shown(self, evaluations: int, start: Start, space: Space, point: np.ndarray, frames: int) -> None:
         self.evaluations = evaluations
-        costs, scores = self._objective(start, space)(point[None])
+        costs, scores = self.objectives.glance(start, space, point)
         self._step("land", (-float(costs[0]), float(scores.iou[0]), float(scores.epe[0])), float(frames))
 
     @property
@@ -196,7 +178,7 @@ class Run:
             seed=self.options.seed,
             solver=self.options.solver,
             fps=reference.fps,
-            looking=on_device if self.engines.on_device(start.scene, space.dimension) else contextlib.nullcontext,
+            look=self.engines.look(start.scene, space.dimension),
         )
 
     def _beginning(self) -> Beginning:
@@ -205,7 +187,9 @@ class Run:
             best = max(self.landed, key=lambda landed: landed.fitness)
             start = self.problem.starts[best.rank]
             space = Space.around(start.scene)
-            return Beginning(start, space, self._aimed(start, space, best.point), first_covariance(best, space))
+            return Beginning(
+                start, space, self.objectives.aimed(start, space, best.point), first_covariance(best, space)
+            )
         start = self.problem.starts[0]
         space = Space.around(start.scene)
         return Beginning(start, space, space.start, np.diag(space.sigma**2))
@@ -264,7 +248,7 @@ class Run:
             PopulationSearch(options, b.mean, b.covariance, b.space.start, landed, before, part) for b in beginnings
         ]
         contenders = [Contender(b.start, b.space, s) for b, s in zip(beginnings, searches, strict=True)]
-        race = Race(contenders, options, before, self._finer)
+        race = Race(contenders, options, before, self.objectives.finer)
         if self._saved is not None:
             try:
                 race.restore(*self._saved)
@@ -283,7 +267,7 @@ class Run:
         @functools.cache
         def objective(k: int, fine: bool) -> Objective:
             start, space = race.contenders[k].start, race.contenders[k].space
-            return self._objective(start, space, self.engines.quick(backend, space.scene.shapes), fine)
+            return self.objectives.of(start, space, self.engines.quick(backend, space.scene.shapes), fine)
 
         while (turn := race.turn()) is not None:
             k, points = turn
@@ -303,7 +287,7 @@ class Run:
         """The best of samples, landing and elites at full resolution, by C MuJoCo, as fields of ``Found``."""
         points = [np.clip(p, 0.0, 1.0) for p in points]
         point = self._best_of(space, start, points)
-        point = self._best_of(space, start, [point, self._aimed(start, space, point)])
+        point = self._best_of(space, start, [point, self.objectives.aimed(start, space, point)])
         known = None
         if self.options.refits:
             self.progress.message(f"{self.options.refits} refits around the solution, for intervals")
@@ -330,13 +314,6 @@ class Run:
             "values": values,
             "known": known,
         }
-
-    def _aimed(self, start: Start, space: Space, point: np.ndarray) -> np.ndarray:
-        """The point as ``aimed`` leaves it, in a hybrid search."""
-        if self.options.optimizer != "hybrid":
-            return point
-        seen = self._objective(start, space, fine=self._finer)
-        return aimed(space, point, seen.simulator, seen.scorer, self.options.seed)
 
     def _best_of(self, space: Space, start: Start, points: list[np.ndarray]) -> np.ndarray:
         return points[int(np.argmin(self._full_costs(space, start, np.stack(points))))]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -133,6 +135,27 @@ def seen_point_flow(
     """``point_flow`` with the effects of ``batch`` [px/frame]; the lens's bend of the pixels themselves is left out."""
     flow = point_flow(acting.apparent(poses, batch, fps), batch, pixels, image)
     return bent_flow(flow, pixels, batch, image, fps) if acting.changes_outlines(batch) else flow
+
+
+Look: TypeAlias = Callable[
+    [np.ndarray, SceneBatch, np.ndarray | None, tuple[int, int], int, float], tuple[np.ndarray, np.ndarray | None]
+]
+"""What ``seen_reach_and_flow`` takes and gives."""
+
+
+def seen_reach_and_flow(
+    poses: Float[np.ndarray, "batch frames objects 7"],
+    batch: SceneBatch,
+    pixels: Float[np.ndarray, "frames objects points 2"] | None,
+    image: tuple[int, int],
+    count: int,
+    fps: float,
+) -> tuple[
+    Float[np.ndarray, "batch frames objects directions"], Float[np.ndarray, "batch frames objects points 2"] | None
+]:
+    """``seen_supports``, and ``seen_point_flow`` where ``pixels`` are given."""
+    flow = None if pixels is None else seen_point_flow(poses, batch, pixels, image, fps)
+    return seen_supports(poses, batch, image, count, fps), flow
 
 
 def bent_flow(

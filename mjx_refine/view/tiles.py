@@ -52,6 +52,14 @@ def _lattice(full: int, wanted: int) -> np.ndarray:
     return np.concatenate([index, np.full(-wanted % SIDE, -1)])
 
 
+def _picked(frames: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Rows and columns of every frame; the frames themselves where that is all of them in order."""
+    for axis, index in ((1, rows), (2, columns)):
+        if not np.array_equal(index, np.arange(frames.shape[axis])):
+            frames = frames.take(index, axis)
+    return frames
+
+
 def _tiled(image: np.ndarray) -> np.ndarray:
     """(T, rows, columns) -> (T, tiles, SIDE * SIDE)."""
     frames, rows, columns = image.shape
@@ -92,17 +100,21 @@ class TileScorer:
     def _build(self, observation: Observation, matching: tuple[int, ...]) -> None:
         rows, columns = self._rows, self._columns
         outside = (rows[:, None] < 0) | (columns[None, :] < 0)
-        masks = foreground(observation)[:, rows][:, :, columns]
-        ids = np.full(masks.shape, len(self.shapes) + 1, np.int32) * (masks > 0)
+        masks = _picked(foreground(observation), rows, columns)
+        if outside.any():
+            masks[:, outside] = 0
+        # Objects cover a few per cent of a view: what is said of them is worked out there alone.
+        where = np.nonzero(masks)
+        own = np.full(len(where[0]), len(self.shapes) + 1, np.int32)
         for n, i in enumerate(matching):
             if i != UNMATCHED:
-                ids[masks == i] = n + 1
-        ids[:, outside] = 0
+                own[masks[where] == i] = n + 1
+        ids = np.zeros(masks.shape, np.int32)
+        ids[where] = own
         flow = np.full((2, self.length, *outside.shape), np.nan, np.float32)
-        flow[:, :-1] = np.moveaxis(observation.flow[:, rows][:, :, columns], -1, 0)
-        flow[:, :, outside] = np.nan
-        if self.moving_only:
-            ids[-1] = 0
+        flow[:, :-1] = np.moveaxis(_picked(observation.flow, rows, columns), -1, 0)
+        if outside.any():
+            flow[:, :, outside] = np.nan
         x = np.where(outside, -1e6, columns[None, :] + 0.5)
         y = np.where(outside, -1e6, rows[:, None] + 0.5)
         self.grid = (len(rows) // SIDE, len(columns) // SIDE)
@@ -113,21 +125,22 @@ class TileScorer:
             flow_x=jnp.asarray(_tiled(flow[0])),
             flow_y=jnp.asarray(_tiled(flow[1])),
         )
-        along, across = flow.astype(np.float64)
-        speed = np.sqrt(along * along + across * across)
-        valid, on_object = np.isfinite(speed), ids > 0
-        speed[~valid] = 0.0
+        speed = np.sqrt(flow[0] * flow[0] + flow[1] * flow[1])
+        valid = np.isfinite(speed)
+        if not valid.all():
+            speed[~valid] = 0.0
 
-        def count(pixels: np.ndarray) -> np.ndarray:
-            return np.count_nonzero(pixels, axis=(1, 2)).astype(np.float64)
+        def sums(values: np.ndarray) -> np.ndarray:
+            """Of what is told of each pixel of objects, by frame."""
+            return np.bincount(where[0], values, self.length).astype(np.float64)
 
         self._observed = {
-            "foreground": count(on_object),
-            "objects": np.stack([count(ids == n + 1) for n in range(len(self.shapes))], -1),
-            "still": speed.sum((1, 2))[:-1],
-            "measured": count(valid)[:-1],
-            "still_object": np.where(on_object, speed, 0.0).sum((1, 2))[:-1],
-            "measured_object": count(valid & on_object)[:-1],
+            "foreground": sums(own > 0),
+            "objects": np.stack([sums(own == n + 1) for n in range(len(self.shapes))], -1),
+            "still": speed.sum((1, 2), dtype=np.float64)[:-1],
+            "measured": np.count_nonzero(valid, axis=(1, 2)).astype(np.float64)[:-1],
+            "still_object": sums(speed[where])[:-1],
+            "measured_object": sums(valid[where])[:-1],
         }
 
     def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Scores:

@@ -19,6 +19,8 @@ from mjx_refine.sim import backends
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.sim.fused.simulator import FusedSimulator
 from mjx_refine.simulate import simulate
+from mjx_refine.view.at_once import reach_and_flow
+from mjx_refine.view.seen import seen_reach_and_flow
 
 SPHERE = KINDS["sphere"]
 
@@ -59,6 +61,18 @@ def test_jacobians_are_simulated_where_that_is_faster(gpu):
     crowd = dataclasses.replace(SPHERE, objects=SPHERE.objects * 9)
     assert made.rollout(crowd, 20) == reference.rollout
     assert gpu == [3]
+
+
+@pytest.mark.parametrize("rows", [3, 70])
+def test_outlines_and_flow_at_once_are_those_one_after_the_other(rows):
+    scene = KINDS["four mixed"]
+    batch = batch_with_effects([near(scene, k) for k in range(rows)])
+    poses = MujocoSimulator(scene.shapes, 30.0, 1).rollout(batch, 6)
+    pixels = np.random.default_rng(0).uniform(40, 200, (6, 4, 5, 2))
+    reach, flow = reach_and_flow(poses, batch, pixels, (240, 160), 16)
+    apart, moved = seen_reach_and_flow(poses, batch, pixels, (240, 160), 16, 30.0)
+    np.testing.assert_allclose(reach, apart, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(flow, moved, rtol=1e-4, atol=1e-3)
 
 
 def test_a_refinement_whose_least_squares_are_the_kernels(gpu, monkeypatch):
