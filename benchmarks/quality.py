@@ -2,6 +2,7 @@
 
     python -m benchmarks.clips --out clips --seed 100
     python -m benchmarks.quality clips [--optimizer hybrid] [--only 00_1_flight,...] [--json quality.json]
+        [--refits 0] [--resolution 480x320]
 
 Each clip is a folder with ``flows.npz`` and ``best32.yaml``, simulated by PyBullet and drawn by its renderer.
 """
@@ -81,6 +82,10 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int)
+    parser.add_argument("--refits", type=int, default=6)
+    parser.add_argument(
+        "--resolution", type=lambda text: tuple(map(int, text.split("x"))), help="of the search's pictures"
+    )
     parser.add_argument("--only", help="names of clips, with commas")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--out", type=Path, help="folder for the refined scenes")
@@ -90,7 +95,7 @@ def main() -> None:
         rows = [row for path in arguments.merge for row in json.loads(path.read_text())["clips"]]
         print(table(sorted(rows, key=lambda row: row["clip"])))
         return
-    names = ("seed", "population", "iterations", "optimizer", "backend", "threads")
+    names = ("seed", "population", "iterations", "optimizer", "backend", "threads", "refits", "resolution")
     options = Options(**{name: getattr(arguments, name) for name in names})
     rows = []
     for folder in sorted(path.parent for path in arguments.folder.glob("*/flows.npz")):
