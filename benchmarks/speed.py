@@ -3,7 +3,7 @@
     MUJOCO_GL=egl python -m benchmarks.speed [--budget 128x100] [--size 480x320] [--frames 30] [--kinds sphere,...]
         [--generations N] [--peer-evaluations 4] [--clips 1,4,16] [--clip-budget 128x100] [--workers N] [--json speed.json]
         [--together 1,4,16,64] [--populations 32,128,512,2048] [--objects 1,2,4,6] [--sizes 120x80,480x320,1280x720]
-        [--second] [--gpu-peers b,c] [--roofline]
+        [--frame-counts 15,30,60] [--single 3] [--second] [--gpu-peers b,c] [--roofline]
 
 Physics, pictures and search are parts of the population search's generations; compilation is what its first costs more,
 with JAX's cache on disk switched off. ``--generations`` runs fewer than the budget; the whole budget's time is then
@@ -11,7 +11,8 @@ called extrapolated. The peer is pycma with `mujoco.rollout` on two threads and 
 evaluation; its time for the budget is always extrapolated. ``--clips`` runs `refine_many` on clips of our own, whole
 refinements (landing, search, intervals, report) at ``--clip-budget``, kinds in turn, programs cached by a clip of each
 kind before; ``--clip-optimizer``, ``--clip-backend`` and ``--clip-refits`` say how. ``--together`` times generations of so
-many clips in lock-step with the last of ``--backends``, ``--gpu-peers`` MJX-Warp's own renderer (b) and plain MJX (c).
+many clips in lock-step with the last of ``--backends``, ``--single`` whole refinements one by one, ``--gpu-peers`` MJX-Warp's
+own renderer (b) and plain MJX (c).
 Nothing is left out for a load of others: the load is printed.
 """
 
@@ -36,11 +37,13 @@ from benchmarks.raster import machine, renderer_problem
 from benchmarks.speed_parts import Clip, generations, peer, update_times
 from benchmarks.speed_scenes import KINDS, make_clip, timed
 from benchmarks.speed_tables import (
+    frames_table,
     gpu_peers_table,
     pictures_table,
     population_table,
     roofline_table,
     second_process_table,
+    single_table,
     together_table,
 )
 from mjx_refine import Job, Options, refine_many
@@ -149,6 +152,11 @@ def device_tables(arguments: argparse.Namespace) -> None:
     if arguments.second:
         os.environ["MJX_REFINE_CACHE"] = tempfile.gettempdir() + "/mjx-refine-speed"
         second_process_table(arguments.kinds, [backend], size)
+    if arguments.single:
+        os.environ["MJX_REFINE_CACHE"] = tempfile.gettempdir() + "/mjx-refine-speed"
+        single_table(arguments.kinds, arguments.single, size)
+    if arguments.frame_counts:
+        frames_table(arguments.kinds[-1], backend, arguments.frame_counts, population, count, size)
     if arguments.together:
         together_table(arguments.kinds, backend, arguments.together, population, count, size)
     if arguments.populations:
@@ -186,7 +194,8 @@ def main() -> None:
     parser.add_argument("--clip-backend", default="auto")
     parser.add_argument("--clip-refits", type=int, default=6)
     parser.add_argument("--workers", type=int)
-    for name in ("--together", "--populations", "--objects"):
+    parser.add_argument("--single", type=int, default=0, help="clips after the first of each kind")
+    for name in ("--together", "--populations", "--objects", "--frame-counts"):
         parser.add_argument(name, type=lambda text: [int(n) for n in text.split(",")], default=[])
     parser.add_argument(
         "--sizes", type=lambda text: [_pair(p) for p in text.split(",")], default=[(120, 80), (480, 320)]

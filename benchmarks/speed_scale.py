@@ -38,17 +38,13 @@ SIX = Scene(
 
 @dataclasses.dataclass(frozen=True)
 class Generation:
-    """Parts of a generation of several clips [s]: proposing and decoding, physics, pictures, learning; and the memory.
-
-    ``peak`` is what JAX's allocator held at most since the process began [bytes]; Warp's own scratch is beside it.
-    """
+    """Parts of a generation of several clips [s]: proposing and decoding, physics, pictures, learning."""
 
     ask: Times
     physics: Times
     pictures: Times
     tell: Times
     whole: Times
-    peak: int
 
 
 def together(
@@ -87,10 +83,7 @@ def together(
         clock.append(time.perf_counter())
         rows.append(np.diff(clock))
     steps = np.array(rows)[1:]
-    stats = jax.devices()[0].memory_stats() or {}
-    return Generation(
-        *(Times(tuple(column)) for column in steps.T), Times(tuple(steps.sum(1))), stats.get("peak_bytes_in_use", 0)
-    )
+    return Generation(*(Times(tuple(column)) for column in steps.T), Times(tuple(steps.sum(1))))
 
 
 def pictures(objects: int, size: tuple[int, int], population: int, count: int, frames: int = 30) -> Times:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import resource
 import tempfile
 from pathlib import Path
 
@@ -12,45 +13,90 @@ import jax.numpy as jnp
 from benchmarks.speed_peers import plain_mjx, warp_renderer
 from benchmarks.speed_scale import first_generation, pictures, together
 from benchmarks.speed_scenes import KINDS, make_clip
+from mjx_refine import load_observation, load_scenes, refine
 from mjx_refine.view import grid
 from mjx_refine.view.frames import Frames
 
 GIB = 2**30
+
+PEAK = "most memory so far: JAX's on the device, the process', GiB"
 
 
 def _head(title: str, columns: list[str]) -> None:
     print(f"\n{title}\n| {' | '.join(columns)} |\n" + "| --- " * len(columns) + "|", flush=True)
 
 
+def _peak() -> str:
+    """What JAX's allocator and the process held at most since the process began."""
+    told = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+    own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return f"{'–' if told is None else f'{told / GIB:.2f}'}; {own / GIB:.2f}"
+
+
 def together_table(kinds: list[str], backend: str, clips: list[int], population: int, count: int, size) -> None:
     """Generations of several clips in lock-step."""
     _head(
         f"Clips in lock-step, {backend}, ms a generation of {population} a clip, parts waited for: median of {count}",
-        ["kind", "clips", "propose", "physics", "pictures 160 wide", "learn", "whole", "a clip", "JAX's peak GiB"],
+        ["kind", "clips", "propose", "physics", "pictures 160 wide", "learn", "whole", "a clip", PEAK],
     )
     for kind in kinds:
         for number in clips:
             g = together(kind, number, backend, population, count, size)
             print(f"| {kind} | {number} | {g.ask} | {g.physics} | {g.pictures} | {g.tell} | {g.whole} "
-                  f"| {1e3 * g.whole.median / number:.1f} | {g.peak / GIB:.2f} |", flush=True)  # fmt: skip
+                  f"| {1e3 * g.whole.median / number:.1f} | {_peak()} |", flush=True)  # fmt: skip
+
+
+def single_table(kinds: list[str], count: int, size) -> None:
+    """Whole refinements of one clip each, as a user calls them: the first of its kind compiles what is not cached."""
+    _head(
+        "One clip, refine(...) with intervals, the default budget, s from call to result",
+        ["kind", "first clip", "of it compilation", *(f"clip {k + 2}" for k in range(count)), "of the last, search",
+         "IoU before, after (means of all but the first)", "on"],
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as temporary:
+        for kind in kinds:
+            folders = [make_clip(Path(temporary) / f"{kind} {k}".replace(" ", "_"), kind, k + 1, size, 30)
+                       for k in range(count + 1)]  # fmt: skip
+            results = [refine(load_scenes(f / "best32.yaml"), load_observation(f / "flows.npz")) for f in folders]
+            later = results[1:] or results
+            before, after = (sum(float(getattr(r, w).scores.iou[0]) for r in later) / len(later)
+                             for w in ("init", "refined"))  # fmt: skip
+            cells = [f"{r.seconds['total']:.1f}" for r in results[1:]]
+            print(f"| {kind} | {results[0].seconds['total']:.1f} | {results[0].seconds['compile']:.1f} | {' | '.join(cells)} "
+                  f"| {results[-1].seconds['search']:.1f} | {before:.3f}, {after:.3f} | {results[-1].device} |",
+                  flush=True)  # fmt: skip
+
+
+def frames_table(kind: str, backend: str, frames: list[int], population: int, count: int, size) -> None:
+    """Generations of one clip by its length."""
+    _head(
+        f"One clip of {kind}, {backend}, ms a generation of {population}",
+        ["frames", "physics", "pictures 160 wide", "whole"],
+    )
+    for number in frames:
+        g = together(kind, 1, backend, population, count, size, number)
+        print(f"| {number} | {g.physics} | {g.pictures} | {g.whole} |", flush=True)
 
 
 def population_table(kind: str, backend: str, populations: list[int], count: int, size) -> None:
     """Generations of one clip by population."""
-    _head(f"One clip of {kind}, {backend}, ms a generation", ["population", "physics", "pictures 160 wide", "whole"])
+    _head(
+        f"One clip of {kind}, {backend}, ms a generation", ["population", "physics", "pictures 160 wide", "whole", PEAK]
+    )
     for population in populations:
         g = together(kind, 1, backend, population, count, size)
-        print(f"| {population} | {g.physics} | {g.pictures} | {g.whole} |", flush=True)
+        print(f"| {population} | {g.physics} | {g.pictures} | {g.whole} | {_peak()} |", flush=True)
 
 
 def pictures_table(objects: list[int], sizes: list[tuple[int, int]], population: int, count: int) -> None:
     """Pictures by size and by objects, every pixel compared."""
     _head(
-        f"Pictures of {population} candidates, 30 frames, every pixel, ms", ["objects", *(f"{w}x{h}" for w, h in sizes)]
+        f"Pictures of {population} candidates, 30 frames, every pixel, ms",
+        ["objects", *(f"{w}x{h}" for w, h in sizes), PEAK],
     )
     for number in objects:
         cells = [str(pictures(number, size, population, count)) for size in sizes]
-        print(f"| {number} | {' | '.join(cells)} |", flush=True)
+        print(f"| {number} | {' | '.join(cells)} | {_peak()} |", flush=True)
 
 
 def second_process_table(kinds: list[str], backends: list[str], size) -> None:
