@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import lapack
 
 from mjx_cmaes.settings import Settings, require
-from mjx_cmaes.state import State
+from mjx_cmaes.state import State, changed
 from mjx_cmaes.types import Points
+
+WIDE = 0.8
+"""Gaussian rows per coordinate up to which they are far from dependent: their products' condition stays below 1e4."""
 
 
 def ask(settings: Settings, state: State) -> tuple[Points, State]:
@@ -28,7 +30,7 @@ def ask(settings: Settings, state: State) -> tuple[Points, State]:
     points = state.mean + state.sigma * state.scale * steps  # (T 40)
     if settings.bounded:
         points = np.clip(points, 0.0, 1.0)
-    return points, replace(state, draws=state.draws + 1, asked=points)
+    return points, changed(state, draws=state.draws + 1, asked=points)
 
 
 def inject(points: Points, given: Float[np.ndarray, "given dimension"]) -> Points:
@@ -58,7 +60,15 @@ def _mirror(normal: Points) -> Points:
     steps = normal[:half].copy()
     for first in range(0, half, n):
         block = steps[first : first + n]
-        frame, upper = np.linalg.qr(block.T)
-        frame *= np.where(np.diag(upper) < 0, -1.0, 1.0)  # makes the frame uniformly distributed
-        steps[first : first + n] = frame.T * np.linalg.norm(block, axis=1)[:, None]
+        steps[first : first + n] = _orthonormal(block) * np.linalg.norm(block, axis=1)[:, None]
     return np.concatenate([steps, -steps])[:population]
+
+
+def _orthonormal(rows: Points) -> Points:
+    """The rows made orthonormal one after the other (Gram-Schmidt): a uniformly distributed frame, if they are Gaussian."""
+    count, n = rows.shape
+    if count <= WIDE * n:
+        # The triangular factor of rows that are far from dependent is that of their products: a third of the time of a QR.
+        return lapack.dtrtrs(np.linalg.cholesky(rows @ rows.T), rows, lower=1)[0]
+    frame, upper = np.linalg.qr(rows.T)
+    return (frame * np.where(np.diag(upper) < 0, -1.0, 1.0)).T

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -95,6 +95,13 @@ class Info:
     """Condition number of C (with diagonal acceleration: of the correlations)."""
 
 
+def changed(state: State, **fields: object) -> State:
+    """``dataclasses.replace``, which calls ``__init__`` with all fields, in a fifteenth of its time."""
+    new = object.__new__(State)
+    vars(new).update(vars(state), **fields)
+    return new
+
+
 def init(
     settings: Settings,
     mean: Vector,
@@ -144,7 +151,7 @@ def restart(settings: Settings, state: State) -> State:
         width = 1.0
     else:
         mean, width = state.best_x, 0.5
-    return replace(
+    return changed(
         state,
         restarts=state.restarts + 1,
         mean=mean,

@@ -107,6 +107,7 @@ class Run:
         self._saved: tuple[dict, dict] | None = None
         self._written = 0.0
         self._searched: Searched | None = None
+        self._loose: np.ndarray | None = None
         if resume and checkpoint is not None:
             loaded = load_checkpoint(checkpoint, self.digest)
             try:
@@ -293,7 +294,9 @@ class Run:
             self.progress.message(f"{self.options.refits} refits around the solution, for intervals")
             known = intervals(self._squares(start, space), point, self.options.refits, self.options.seed)
             point = self._best_of(space, start, [point, known.point])
-        loose = insensitive(space, point, lambda p: objective(p)[0])
+        loose = self._loose
+        if loose is None:
+            loose = insensitive(space, point, lambda p: objective(p)[0])
         point = back_to_start(space, point, loose, lambda p: self._full_costs(space, start, p))
         scene = space.scene_at(point)
         scores = self.problem.score([scene], start.matching)
@@ -371,5 +374,5 @@ class Run:
         if values["searching"]:
             self._saved = (values, arrays)
         if values.get("searched") is not None:
-            self._searched = Searched(*values["searched"])
+            self._searched, self._loose = Searched(*values["searched"]), arrays.get("loose")
         self.progress.message(f"resumed after {self.evaluations} rollouts")

@@ -18,6 +18,7 @@ from mjx_refine.search.objective import launched, price_of_overlap
 from mjx_refine.search.population import PopulationSearch
 from mjx_refine.search.progress import Step
 from mjx_refine.search.ready import Ready, Searched
+from mjx_refine.search.undetermined import around, unmoved
 from mjx_refine.sim.backends import Simulator
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.space import decode_together
@@ -88,8 +89,8 @@ class Member:
         if time.monotonic() - self.written > CHECKPOINT_SECONDS:
             self.save()
 
-    def save(self, searched: Searched | None = None) -> None:
-        """Writes the checkpoint; with ``searched`` a resumed run goes on to the finish."""
+    def save(self, searched: Searched | None = None, loose: np.ndarray | None = None) -> None:
+        """Writes the checkpoint; with ``searched`` a resumed run goes on to the finish, and knows ``loose`` parameters."""
         saved = self.search.saved()
         if saved is not None:
             self.values.update(saved[0], searching=True)
@@ -97,6 +98,8 @@ class Member:
         self.values.update(evaluations=self.search.evaluations, seconds=self._seconds)
         if searched is not None:
             self.values["searched"] = dataclasses.astuple(searched)
+        if loose is not None:
+            self.arrays["loose"] = loose
         values = {key: value for key, value in self.values.items() if key != "version"}
         save_checkpoint(self.ready.checkpoint, values, self.arrays)
         self.written = time.monotonic()
@@ -152,24 +155,48 @@ class Together:
 
     def _asked(self) -> list[Asked]:
         """Members that go on, and their points; the others leave."""
-        asked, staying = [], []
+        asked, staying, leaving = [], [], []
         for member in self.members:
             try:
                 points = member.search.points()
                 if points is None:
-                    self._leaves(member)
+                    leaving.append(member)
                     continue
                 asked.append((member, member.ready.space.checked(points)))
                 staying.append(member)
             except Exception as error:  # one clip's failure is its own
                 self.ended(member, error)
         self.members = staying
+        self._leave(leaving)
         return asked
 
-    def _leaves(self, member: Member) -> None:
+    def _leave(self, members: list[Member]) -> None:
         seconds = time.monotonic() - self.began
-        member.save(Searched(str(member.search.reason), self.simulator.name, self.simulator.device, seconds))
-        self.ended(member, None)
+        loose = self._insensitive(members)
+        for member in members:
+            try:
+                searched = Searched(str(member.search.reason), self.simulator.name, self.simulator.device, seconds)
+                member.save(searched, loose.get(id(member)))
+                self.ended(member, None)
+            except Exception as error:
+                self.ended(member, error)
+
+    def _insensitive(self, members: list[Member]) -> dict[int, np.ndarray]:
+        """Parameters on which the score does not depend around the best candidate, by member: while all are here that takes a
+        generation or two, of each alone a second of a core. In batches as large as a generation's: nothing is compiled."""
+        points = {id(m): around(m.ready.space, m.search.elites[0]) for m in members}
+        costs: dict[int, list[np.ndarray]] = {key: [] for key in points}
+        sizes = {id(m): m.search.population for m in members}
+        try:
+            for k in range(max((-(-len(points[key]) // size) for key, size in sizes.items()), default=0)):
+                asked = [(m, _rows(points[id(m)], k, sizes[id(m)])) for m in members]
+                for part in _parts(asked, self.most):
+                    for (member, _), (own, _) in zip(part, self._evaluated(part), strict=True):
+                        costs[id(member)].append(own)
+        except Exception as error:
+            log.info("parameters that do not act are found clip by clip (%s)", error)
+            return {}
+        return {key: unmoved(np.concatenate(own)[: len(points[key])]) for key, own in costs.items()}
 
     def _generation(self, part: list[Asked]) -> None:
         try:
@@ -211,6 +238,12 @@ class Together:
         own = np.split(prices, np.cumsum(counts)[:-1])
         rows = [self.rows[id(member)] for member, _ in part]
         return [(own[row] - scores[row].fitness, scores[row]) for row in rows]
+
+
+def _rows(points: np.ndarray, k: int, size: int) -> np.ndarray:
+    """The k-th ``size`` rows, the first one again beyond the last."""
+    rows = np.arange(k * size, (k + 1) * size)
+    return points[np.where(rows < len(points), rows, 0)]
 
 
 def _parts(asked: list[Asked], most: int) -> list[list[Asked]]:

@@ -20,9 +20,18 @@ def insensitive(
     space: Space, point: Float[np.ndarray, "dimension"], costs: Callable[[np.ndarray], np.ndarray]
 ) -> Bool[np.ndarray, "dimension"]:
     """Whether one prior width up and one down each change the cost by less than 0.002, parameter by parameter."""
+    return unmoved(costs(around(space, point)))
+
+
+def around(space: Space, point: Float[np.ndarray, "dimension"]) -> Float[np.ndarray, "points dimension"]:
+    """The point, then one prior width up in each parameter, then down."""
     steps = np.diag(space.sigma)
-    points = np.clip(np.concatenate([point[None], point + steps, point - steps]), 0.0, 1.0)
-    price = np.nan_to_num(costs(points), nan=1e9, posinf=1e9)
+    return np.clip(np.concatenate([point[None], point + steps, point - steps]), 0.0, 1.0)
+
+
+def unmoved(costs: Float[np.ndarray, "points"]) -> Bool[np.ndarray, "dimension"]:
+    """Which parameters hardly change the cost, by the costs of the points that ``around`` gives."""
+    price = np.nan_to_num(costs, nan=1e9, posinf=1e9)
     change = np.abs(price[1:] - price[0]).reshape(2, -1)
     return (change < INSENSITIVE).all(0)
 

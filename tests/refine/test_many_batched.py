@@ -22,6 +22,7 @@ from mjx_refine.search.checkpoint import load_checkpoint
 from mjx_refine.search.objective import Objective
 from mjx_refine.search.ready import Searched
 from mjx_refine.search.together import Member, Together
+from mjx_refine.search.undetermined import insensitive
 from mjx_refine.sim import backends
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.sim.fused import LARGEST
@@ -188,6 +189,7 @@ def test_after_a_search_elsewhere_a_run_finishes_without_one(clips, tmp_path, mo
     (member,) = members_of(clips[:1], tmp_path, options)
     Together([member], MujocoSimulator(("sphere",), 30.0, 1), lambda member, error: None).run()
     monkeypatch.setattr("mjx_refine.search.engines.make_simulator", lambda *_, **__: pytest.fail("searched again"))
+    monkeypatch.setattr("mjx_refine.search.run.insensitive", lambda *_: pytest.fail("looked at again"))
     outcome = work(jobs_of(clips[:1])[0], tmp_path, options)
     assert outcome.status == "done"
     assert outcome.evaluations == 48
@@ -211,6 +213,21 @@ def test_what_a_search_does_not_change_is_done_while_it_runs(clips, tmp_path, mo
         ends.append(json.loads((tmp_path / str(early) / "a/result.json").read_text()))
     assert ends[0]["derivatives"] == ends[1]["derivatives"]
     assert ends[0]["refined"] == ends[1]["refined"]
+
+
+def test_parameters_that_do_not_act_are_found_before_clips_leave(clips, tmp_path):
+    """In as many rows as a generation has, which here are fewer than the points around the best candidate."""
+    members = members_of(clips[:2], tmp_path, dataclasses.replace(TINY, optimizer="cmaes"))
+    Together(members, MujocoSimulator(("sphere",), 30.0, 1), lambda member, error: None).run()
+    for member, clip in zip(members, clips, strict=False):
+        space, best = member.ready.space, member.search.elites[0]
+        assert 1 + 2 * space.dimension > member.search.population
+        alone = objective_alone(member, clip)
+        expected = insensitive(space, best, lambda points, alone=alone: alone(points)[0])
+        assert 0 < expected.sum() < space.dimension
+        found = load_checkpoint(member.ready.checkpoint, member.values["digest"])
+        assert found is not None
+        np.testing.assert_array_equal(found[1]["loose"], expected)
 
 
 @pytest.mark.parametrize("masks", [True, False])
