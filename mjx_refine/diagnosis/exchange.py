@@ -49,3 +49,17 @@ def _again(clip: ClipFit, fit: Fit, sources: list[np.ndarray], count: int) -> Fi
         return fit
     again = clip.fit(fit.hypothesis, points[best], ITERATIONS)
     return again if again.evidence > fit.evidence else fit
+
+
+def at_least_nothing(clip: ClipFit, base: Fit, fitted: Fitted) -> Fitted:
+    """Fits that ended above what their effect gives at size nothing stand there instead: an effect of no size is the base model,
+    so that is where they could have ended, and their derivatives there say what size the clip rules out."""
+    behind = [key for key, (fit, _) in fitted.items() if fit.cost > base.cost]
+    fits = clip.crew.each(clip, _of_nothing, [(base, fitted[key][0]) for key in behind])
+    return {**fitted, **{key: (fit, fitted[key][1]) for key, fit in zip(behind, fits, strict=True)}}
+
+
+def _of_nothing(clip: ClipFit, base: Fit, fit: Fit) -> Fit:
+    nothing = np.zeros(len(fit.z) - len(base.z))
+    there = clip.at(fit.hypothesis, np.concatenate([base.z, nothing]))
+    return there if there.evidence > fit.evidence else fit

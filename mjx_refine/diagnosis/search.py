@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from mjx_refine.diagnosis.base import base_space, stored_base
-from mjx_refine.diagnosis.exchange import Fitted, Key, exchanged
+from mjx_refine.diagnosis.exchange import Fitted, Key, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.fitted import Explained
 from mjx_refine.diagnosis.knock import knocked
@@ -181,6 +181,7 @@ def _singles(
     for key, fit in zip(first, clip.crew.each(clip, _roamed, [(fitted[key][0], seed) for key in first]), strict=True):
         fitted[key] = (fit, fitted[key][1])
     base, fitted = exchanged(clip, base, fitted)
+    fitted = at_least_nothing(clip, base, fitted)
     finals = [Candidate(fit, _lead(fit, base), promise) for fit, promise in fitted.values()]
     return base, tuple(sorted(finals, key=lambda c: -c.lead))
 

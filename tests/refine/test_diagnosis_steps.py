@@ -8,7 +8,7 @@ import pytest
 
 from mjx_refine.diagnosis.chaos import DRAWS, EXCUSED, believed, drawn, jaggedness
 from mjx_refine.diagnosis.crew import Crew
-from mjx_refine.diagnosis.exchange import exchanged
+from mjx_refine.diagnosis.exchange import at_least_nothing, exchanged
 from mjx_refine.diagnosis.fitted import Fit
 from mjx_refine.diagnosis.measure import Parts
 from mjx_refine.diagnosis.pace import ATTEMPTS, STEPS, damped, descended, updated
@@ -204,3 +204,18 @@ def test_hypotheses_hand_each_other_base_parameters_and_none_gets_worse():
     assert shared[("best", -1)][0] is best
     assert shared[("far", -1)][1] == 2.0
     assert all(shared[key][0].cost <= fit.cost for key, (fit, _) in fitted.items())
+
+
+def test_effects_that_ended_behind_the_base_model_stand_at_no_size():
+    clip = _Stuck()
+    clip.at = lambda hypothesis, z: clip.fit(hypothesis, z, 0)  # type: ignore[attr-defined]
+    base = clip.fit(_Bowl((0.0, 0.0)), np.array([0.5, 0.0]), 0)
+    ahead = clip.fit(_Bowl((0.0, 0.0, 1.0)), np.array([0.1, 0.0, 1.0]), 0)
+    behind = clip.fit(_Bowl((0.0, 0.0, 0.0)), np.array([2.0, 2.0, 0.5]), 0)
+    placed = clip.fit(_Bowl((0.0, 0.0, 9.0)), np.array([0.0, 0.0, 8.0]), 0)  # of which size nothing is another place
+    fitted = {("ahead", -1): (ahead, 1.0), ("behind", -1): (behind, 2.0), ("placed", 0): (placed, 3.0)}
+    told = at_least_nothing(clip, base, fitted)  # type: ignore[arg-type]
+    assert told[("ahead", -1)][0] is ahead
+    assert np.allclose(told[("behind", -1)][0].z, [0.5, 0.0, 0.0])
+    assert told[("behind", -1)][1] == 2.0
+    assert told[("placed", 0)][0] is placed
