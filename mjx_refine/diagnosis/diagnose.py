@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Callable
 
@@ -38,6 +39,9 @@ LEAST_IOU = 0.05
 
 LEAST_MOTION = 1.0
 """How far something must move [px]."""
+
+TIED = 0.95
+"""Correlation of two numbers of an effect from which a note says so."""
 
 TOLD_APART = 0.15
 """Share of the named effects' probability from which an effect is not told apart from the likeliest."""
@@ -218,7 +222,7 @@ def _result(
         map_before=map_before,
         map_after=map_after,
         channels=channels,
-        notes=_notes(clip, compared, matching, names),
+        notes=_notes(clip, compared, matching, names, best),
         signs=dataclasses.asdict(found),
         seconds=time.monotonic() - began,
         rollouts=int(clip.rollouts),
@@ -322,8 +326,28 @@ def values_of(
     return result
 
 
-def _notes(clip: ClipFit, compared: Compared, matching, names) -> tuple[str, ...]:
-    notes = []
+def tied(fit: Fit) -> list[str]:
+    """Sentences about numbers of one effect that do each other's work."""
+    covariance = np.linalg.inv(fit.curvature)
+    correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    first, told = fit.hypothesis.space.dimension, []
+    for t in fit.hypothesis.terms:
+        free = np.nonzero(t.free)[0]
+        names = [p.name for p in t.kind.parameters]
+        if all(p.length == 0 for p in t.kind.parameters):
+            for i, j in itertools.combinations(range(len(free)), 2):
+                rho = float(correlation[first + i, first + j])
+                if abs(rho) > TIED:
+                    told.append(
+                        f"{names[free[i]]} and {names[free[j]]} of {t.name} do each other's work in this clip (correlation "
+                        f"{rho:.2f}): what is known is their combination."
+                    )
+        first += len(free)
+    return told
+
+
+def _notes(clip: ClipFit, compared: Compared, matching, names, best: Candidate | None) -> tuple[str, ...]:
+    notes = [] if best is None else tied(best.fit)
     lost = [n for n, i in zip(names, matching, strict=True) if i < 0]
     if lost:
         notes.append(f"No mask belongs to {', '.join(lost)}: nothing is known of it.")

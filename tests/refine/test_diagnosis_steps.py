@@ -8,8 +8,10 @@ import pytest
 
 from mjx_refine.diagnosis.chaos import DRAWS, EXCUSED, believed, drawn, jaggedness
 from mjx_refine.diagnosis.crew import Crew
+from mjx_refine.diagnosis.diagnose import tied
 from mjx_refine.diagnosis.exchange import at_least_nothing, exchanged
 from mjx_refine.diagnosis.fitted import Fit
+from mjx_refine.diagnosis.hypothesis import term
 from mjx_refine.diagnosis.measure import Parts
 from mjx_refine.diagnosis.pace import ATTEMPTS, STEPS, damped, descended, updated
 from mjx_refine.diagnosis.roam import Strategy
@@ -219,3 +221,17 @@ def test_effects_that_ended_behind_the_base_model_stand_at_no_size():
     assert np.allclose(told[("behind", -1)][0].z, [0.5, 0.0, 0.0])
     assert told[("behind", -1)][1] == 2.0
     assert told[("placed", 0)][0] is placed
+
+
+@pytest.mark.parametrize(("likeness", "told"), [(0.99, 1), (0.5, 0)])
+def test_numbers_of_an_effect_that_do_each_others_work_are_told(likeness, told):
+    drag = term("drag", 0, 10)
+    hypothesis = SimpleNamespace(
+        space=SimpleNamespace(dimension=1), terms=(drag,), tails=np.array([6.0, np.inf, np.inf])
+    )
+    across = np.sqrt(1 - likeness**2)
+    jacobian = 50 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, likeness], [0.0, 0.0, across]])
+    fit = Fit(hypothesis, np.zeros(3), 0.0, 0.0, jacobian, np.zeros(3), 0.0)  # type: ignore[arg-type]
+    sentences = tied(fit)
+    assert len(sentences) == told
+    assert all(line.startswith("linear and quadratic of drag") for line in sentences)
