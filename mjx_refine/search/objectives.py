@@ -60,9 +60,12 @@ class Objectives:
         """The point as ``aim.aimed`` leaves it, in a hybrid search."""
         if self.options.optimizer != "hybrid":
             return point
-        with self._place(start, space):
-            seen = self._between(start, space, fine=self.finer)
-            return aimed(space, point, seen.simulator, seen.scorer, self.options.seed)
+        key = ("aimed", start.index, point.tobytes())
+        if key not in self.problem.kept:
+            with self._place(start, space):
+                seen = self._between(start, space, fine=self.finer)
+                self.problem.kept[key] = aimed(space, point, seen.simulator, seen.scorer, self.options.seed)
+        return self.problem.kept[key]
 
     def _between(self, start: Start, space: Space, fine: bool = False) -> Objective:
         """Of few candidates between searches: on the device where least squares is there too."""
