@@ -32,6 +32,9 @@ CANDIDATES = 8192
 LEAST = 64
 """A batch that does not fit in memory and is no larger than this fails."""
 
+MOST_OF_THEM = 0.6
+"""Part of a group's candidates from which those that leave at once are looked at once more together."""
+
 DEVICE = threading.RLock()
 """One thread at a time gives the device something to do: Warp builds and records its kernels for all of a process. Threads wait
 for their rollouts without it."""
@@ -142,6 +145,7 @@ class Together:
         with DEVICE:
             self.scorer = GridScorer(first.shapes, clips, weights)
         self.rows = {id(member): row for row, member in enumerate(members)}
+        self._candidates = sum(member.search.population for member in members)
 
     def run(self) -> None:
         """Runs all searches to their ends."""
@@ -182,8 +186,11 @@ class Together:
                 self.ended(member, error)
 
     def _insensitive(self, members: list[Member]) -> dict[int, np.ndarray]:
-        """Parameters on which the score does not depend around the best candidate, by member: while all are here that takes a
-        generation or two, of each alone a second of a core. In batches as large as a generation's: nothing is compiled."""
+        """Parameters on which the score does not depend around the best candidate, by member: of all together that takes a
+        generation or two, of each alone a second of a core. Where few leave it is left to them: a batch as large as a
+        generation's compiles nothing, a smaller one would."""
+        if sum(member.search.population for member in members) < MOST_OF_THEM * self._candidates:
+            return {}
         points = {id(m): around(m.ready.space, m.search.elites[0]) for m in members}
         costs: dict[int, list[np.ndarray]] = {key: [] for key in points}
         sizes = {id(m): m.search.population for m in members}

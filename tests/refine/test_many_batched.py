@@ -230,6 +230,14 @@ def test_parameters_that_do_not_act_are_found_before_clips_leave(clips, tmp_path
         np.testing.assert_array_equal(found[1]["loose"], expected)
 
 
+def test_a_clip_that_leaves_before_the_others_looks_for_itself(clips, tmp_path):
+    members = members_of(clips[:2], tmp_path, dataclasses.replace(TINY, optimizer="cmaes"))
+    members[0].search.reason = "over"
+    Together(members, MujocoSimulator(("sphere",), 30.0, 1), lambda member, error: None).run()
+    kept = [load_checkpoint(member.ready.checkpoint, member.values["digest"]) for member in members]
+    assert [found is not None and "loose" in found[1] for found in kept] == [False, False]
+
+
 @pytest.mark.parametrize("masks", [True, False])
 def test_grids_score_as_tiles_do(clips, masks):
     scene: Scene = load_scenes(clips[0] / "best32.yaml")[0]
