@@ -8,8 +8,8 @@
 Physics, pictures and search are parts of the population search's generations; compilation is what its first costs more,
 with JAX's cache on disk switched off. ``--generations`` runs fewer than the budget; the whole budget's time is then
 called extrapolated. The peer is pycma with `mujoco.rollout` on two threads and MuJoCo's renderer for segmentation, by
-evaluation; its time for the budget is always extrapolated. ``--clips`` runs `refine_many` on clips of our own, whole
-refinements (landing, search, intervals, report) at ``--clip-budget``, kinds in turn, programs cached by a clip of each
+evaluation, beside ours with the last of ``--backends``; its time for the budget is always extrapolated.
+``--clips`` runs `refine_many` on clips of our own, whole refinements (landing, search, intervals, report) at ``--clip-budget``, kinds in turn, programs cached by a clip of each
 kind before; ``--clip-optimizer``, ``--clip-backend`` and ``--clip-refits`` say how. ``--together`` times generations of so
 many clips in lock-step with the last of ``--backends``, ``--single`` whole refinements one by one, ``--gpu-peers`` MJX-Warp's
 own renderer (b) and plain MJX (c).
@@ -88,12 +88,13 @@ def peer_table(arguments: argparse.Namespace, ours: dict) -> None:
         f"\nPeer, ms an evaluation: median [quartiles]; pictures of {arguments.peer_evaluations} candidates in 3 generations"
     )
     print(
-        "| kind | physics | pictures, masks only | search | an evaluation | ours (mujoco) | budget, h (extrapolated) |"
+        f"| kind | physics | pictures, masks only | search | an evaluation | ours ({arguments.backends[-1]}) "
+        "| budget, h (extrapolated) |"
     )
     print("| --- " * 7 + "|")
     for kind in arguments.kinds:
         p = peer(Clip(kind, arguments.size, arguments.frames), population, arguments.peer_evaluations)
-        mine = ours.get(f"{kind}, mujoco")
+        mine = ours.get(f"{kind}, {arguments.backends[-1]}")
         told = "" if mine is None else f"{1e3 * mine['whole'] / population:.2f}"
         hours = p.evaluation * population * iterations / 3600
         print(
