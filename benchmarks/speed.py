@@ -9,10 +9,10 @@ Physics, pictures and search are parts of the population search's generations; c
 with JAX's cache on disk switched off. ``--generations`` runs fewer than the budget; the whole budget's time is then
 called extrapolated. The peer is pycma with `mujoco.rollout` on two threads and MuJoCo's renderer for segmentation, by
 evaluation, beside ours with the last of ``--backends``; its time for the budget is always extrapolated.
-``--clips`` runs `refine_many` on clips of our own, whole refinements (landing, search, intervals, report) at ``--clip-budget``, kinds in turn, programs cached by a clip of each
-kind before; ``--clip-optimizer``, ``--clip-backend`` and ``--clip-refits`` say how. ``--together`` times generations of so
-many clips in lock-step with the last of ``--backends``, ``--single`` whole refinements one by one, ``--gpu-peers`` MJX-Warp's
-own renderer (b) and plain MJX (c).
+``--clips`` runs `refine_many` on clips of our own, whole refinements (landing, search, intervals, report) at
+``--clip-budget``, kinds in turn, programs cached by a clip of each kind before; ``--clip-optimizer``, ``--clip-backend`` and
+``--clip-refits`` say how. ``--together`` times generations of so many clips in lock-step with the last of ``--backends``,
+``--single`` whole refinements one by one, ``--gpu-peers`` MJX-Warp's own renderer (b) and plain MJX (c).
 Nothing is left out for a load of others: the load is printed.
 """
 

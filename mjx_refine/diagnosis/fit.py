@@ -22,7 +22,7 @@ from mjx_refine.diagnosis.settled import Loose, Settled
 from mjx_refine.diagnosis.slack import PART, Impact, Slack, Slacks, impacts, kicked, sustained, too_wide, touching
 from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
 from mjx_refine.scene import Shape
-from mjx_refine.search.landing import slowed
+from mjx_refine.search.residuals import slowed
 from mjx_refine.sim.backends import Simulator
 from mjx_refine.sim.c import MujocoSimulator
 

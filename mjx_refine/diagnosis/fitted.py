@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.search.landing import slowed
+from mjx_refine.search.residuals import slowed
 
 
 @dataclasses.dataclass(frozen=True)

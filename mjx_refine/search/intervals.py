@@ -20,8 +20,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mjx_refine.search.landing import LeastSquares, slowed
+from mjx_refine.search.landing import LeastSquares
 from mjx_refine.search.noise import DRAWS, TREMBLE, Noise, measured, unmeasured
+from mjx_refine.search.residuals import slowed
 from mjx_refine.space import Space
 
 CONFIDENCE = 0.90

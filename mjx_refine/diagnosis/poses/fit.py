@@ -23,7 +23,7 @@ from mjx_refine.diagnosis.predict import Prediction
 from mjx_refine.diagnosis.settled import Loose
 from mjx_refine.diagnosis.slack import PART, Impact, Slacks, impacts, sustained, touching
 from mjx_refine.diagnosis.store import fingerprint
-from mjx_refine.search.landing import slowed
+from mjx_refine.search.residuals import slowed
 from mjx_refine.sim.backends import Simulator
 
 VIDEO = 30.0

@@ -1,0 +1,158 @@
+"""Residuals of points in the unit box: how far simulated outlines and flow are from a clip's, and their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.search.features import DIRECTIONS, POINTS, Outlines, flow_of_objects
+from mjx_refine.space import Space
+from mjx_refine.view.seen import Look, seen_reach_and_flow
+
+if TYPE_CHECKING:
+    from mjx_refine.search.derivatives import Automatic
+
+FLOW_NOISE = 1.0
+"""Standard deviation of measured flow inside a mask [px at a picture 480 wide]."""
+
+FLOW_SCALE = 2.0
+"""Scale of its robust loss: measured flow of fast-spinning bodies is wrong by several pixels."""
+
+NOISE_FLOOR = 0.5
+"""Standard deviation of a mask's edge [px at a picture 480 wide]."""
+
+EDGE_WEIGHT = float(np.sqrt(6 / DIRECTIONS)) / NOISE_FLOOR
+MOTION_WEIGHT = float(np.sqrt(2 / POINTS)) / FLOW_NOISE
+"""Of one direction of an outline, and of one coordinate of the flow at one point [1 / px at a picture 480 wide]."""
+
+
+class Residuals:
+    """The residuals of points in the unit box, and what they cost.
+
+    Args:
+      space: the parameters.
+      rollout: poses of a batch for a number of frames.
+      seen: the observed outlines.
+      columns: for each object the column of ``seen`` that belongs to it, or -1.
+      image: (width, height) [px].
+      flow: pixels and observed flow of every mask (``flow_points``), or None to go by outlines alone.
+      limit, seed, solver: of what minimises them: rollouts that may be spent; of the points tried when the horizon grows; what
+        runs inside a stage, ``lm``, ours, or one of ``solvers``.
+      automatic: derivatives where it has some; None: differences alone.
+      fps: frames a second, for effects.
+      look: tells reach and flow, as ``seen_reach_and_flow`` does.
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        rollout: Callable[[SceneBatch, int], np.ndarray],
+        seen: Outlines,
+        columns: tuple[int, ...],
+        image: tuple[int, int],
+        flow: tuple[np.ndarray, np.ndarray] | None = None,
+        limit: int = 10**9,
+        seed: int = 0,
+        solver: str = "lm",
+        automatic: Automatic | None = None,
+        fps: float = 30.0,
+        look: Look = seen_reach_and_flow,
+    ):
+        self.look = look
+        self.limit, self.seed, self.solver, self.automatic = limit, seed, solver, automatic
+        self.space, self.rollout, self.image, self.fps = space, rollout, image, fps
+        self.pixel = image[0] / 480.0
+        target = np.full((len(seen.support), len(columns), DIRECTIONS), np.nan)
+        for n, j in enumerate(columns):
+            if j >= 0:
+                target[:, n] = seen.support[:, j]
+        self.target = target
+        self.pixels, self.flow = flow_of_objects(flow, columns)
+        self.spent = 0.0
+
+    def distances(self, points: np.ndarray, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Simulated minus observed reach (B, frames, N, directions) and flow (B, frames, N, 2 * points), both in px at
+        480 wide, and whether a candidate diverged."""
+        batch = self.space.decode(points)
+        poses = self.rollout(batch, frames)
+        self.spent += len(points) * frames / len(self.target)
+        bad = np.logical_not(np.asarray(np.isfinite(poses).all((1, 2, 3))))
+        poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
+        # The outlines of all frames, so that one length is compiled; those beyond the horizon repeat its last.
+        beyond = np.repeat(poses[:, -1:], len(self.target) - frames, axis=1)
+        poses = np.concatenate([poses, beyond], 1)
+        pixels = self.pixels if self.flow is not None and frames > 1 else None
+        seen, moved = self.look(poses, batch, pixels, self.image, DIRECTIONS, self.fps)
+        reach = seen[:, :frames] - self.target[:frames]
+        flow = np.full((len(points), frames, len(batch.shapes), 0), np.nan)
+        if moved is not None and self.flow is not None:
+            moved = moved[:, :frames] - self.flow[:frames]
+            moved[:, frames - 1] = np.nan
+            flow = moved.reshape(*moved.shape[:3], -1)
+        return reach / self.pixel, flow / self.pixel, bad
+
+    def _robust(self, reach: np.ndarray, flow: np.ndarray, scale: float) -> np.ndarray:
+        """Residuals in noise widths, (B, frames, N, directions + 2 * points), zero where nothing was seen.
+
+        Their growth slows beyond ``scale`` but never ends: a pull at any distance. Neither the edges of one mask nor the
+        flow at its points are independent: its directions together count as six, its flow as two vectors.
+        """
+        edges = slowed(np.nan_to_num(reach), scale) * EDGE_WEIGHT
+        motion = slowed(np.nan_to_num(flow), FLOW_SCALE) * MOTION_WEIGHT
+        return np.concatenate([edges, motion], -1)
+
+    def residuals(self, points: np.ndarray, frames: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
+        """(robust residuals (B, R), their half sum of squares with the prior (B,))."""
+        reach, flow, bad = self.distances(points, frames)
+        robust = self._robust(reach, flow, scale).reshape(len(points), -1)
+        prior = (points - self.space.start) / self.space.sigma
+        cost = 0.5 * (robust**2).sum(-1) + 0.5 * (prior**2).sum(-1)
+        return robust, np.where(bad, np.inf, cost)
+
+    def jacobian(self, point: np.ndarray, base: np.ndarray, frames: int, scale: float) -> np.ndarray:
+        """d residuals / d (prior widths), (R, D): automatic, or else finite differences towards the inside of the box."""
+        result, held = np.zeros((len(base), len(point))), np.zeros(len(point), bool)
+        with_flow = self.flow is not None and frames > 1
+        told = self.automatic and self.automatic(point, frames, self.image, self.pixels if with_flow else None)
+        if told:
+            columns, held = told
+            # A tangent is pushed through one rollout.
+            self.spent += len(columns) * frames / len(self.target)
+            slopes = self._robust_slopes(base.reshape(columns.shape[1:]), frames, scale)
+            result[:, held] = (columns / self.pixel * slopes).reshape(len(columns), -1).T
+        if not held.all():
+            step = 0.05 * self.space.sigma
+            sign = np.where(point + step > 1.0, -1.0, 1.0)
+            points = (point + np.diag(sign * step))[~held]
+            moved, _ = self.residuals(np.clip(points, 0.0, 1.0), frames, scale)
+            result[:, ~held] = ((moved - base) / (sign[~held, None] * 0.05)).T
+        return result
+
+    def _robust_slopes(self, base: np.ndarray, frames: int, scale: float) -> np.ndarray:
+        """Derivatives of ``_robust`` in the raw distances, told from its own values; zero where nothing was seen."""
+        seen = np.isfinite(self.target[:frames])
+        factors = np.full(base.shape[-1], EDGE_WEIGHT)
+        scales = np.full(base.shape[-1], scale)
+        factors[DIRECTIONS:], scales[DIRECTIONS:] = MOTION_WEIGHT, FLOW_SCALE
+        if self.flow is not None and frames > 1:
+            measured = np.isfinite(self.flow[:frames]).reshape(*seen.shape[:2], -1)
+            measured[frames - 1] = False
+            seen = np.concatenate([seen, measured], -1)
+        # With q = raw / scale and L = log(1 + q^2) the residual is sqrt(L), and its derivative q / ((1 + q^2) sqrt(L)).
+        grown = (base / factors / scales) ** 2
+        slopes = np.sqrt(np.expm1(grown) / np.maximum(grown, 1e-300)) * np.exp(-grown)
+        return np.where(seen, np.where(grown > 1e-12, slopes, 1.0) * factors, 0.0)
+
+    @property
+    def evaluations(self) -> int:
+        """Rollouts so far, in units of the whole clip: one of half its frames counts half."""
+        return int(np.ceil(self.spent))
+
+
+def slowed(raw: Float[np.ndarray, "*shape"], scale: float | np.ndarray) -> Float[np.ndarray, "*shape"]:
+    """Residuals whose squares are Cauchy's loss: as they are below ``scale``, growing ever more slowly beyond."""
+    return np.sign(raw) * scale * np.sqrt(np.log1p((raw / scale) ** 2))
