@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mjx_refine.search.landing import LeastSquares
-from mjx_refine.search.noise import DRAWS, TREMBLE, Noise, measured, unmeasured
-from mjx_refine.search.residuals import slowed
+from mjx_refine.search.noise import Noise
+from mjx_refine.search.posterior import Posterior
 from mjx_refine.space import Space
 
 CONFIDENCE = 0.90
@@ -46,14 +46,6 @@ MOTION_FITS = 1.5
 DETERMINED = 0.3
 """Standard error, in prior widths, below which the clip is said to determine a parameter."""
 
-CAUCHY = 2.5
-"""Residuals beyond this many standard deviations count less (Cauchy's loss)."""
-
-STEP = 0.05
-"""Finite-difference step of the first Jacobian, and largest of the later ones [prior widths]."""
-
-LEAST_STEP = 0.003
-ITERATIONS = 8
 LEAST_AXIS = 0.003
 SETTLE, REFIT = 8, 3
 """Iterations of the first spread, and of each refit's."""
@@ -65,12 +57,6 @@ most a prior width."""
 SCALE = 0.12
 """Standard deviation of the logarithm of a sample's overall scale: its lengths, speeds and gravity are wrong together,
 and no clip tells."""
-
-RIDGES = (0.0, 0.1, 1.0, 10.0, 100.0)
-TRIALS = np.array([1e-4, 1e-2, 1.0, 1e2, 1e4])
-
-FEW, REMEMBERED = 8, 64
-"""Rows of a batch whose distances are kept, and how many are: the trials of a fit."""
 
 SCALED = ("m", "m/s", "m/s^2")
 """Units of what the overall scale multiplies."""
@@ -125,131 +111,6 @@ class Intervals:
     evaluations: int
 
 
-@dataclasses.dataclass(frozen=True)
-class _Fit:
-    point: np.ndarray
-    cost: float
-    covariance: np.ndarray
-
-
-class _Posterior:
-    """Minus the log posterior of points at a measured noise, and Levenberg-Marquardt on it."""
-
-    def __init__(self, squares: LeastSquares):
-        self.squares, self.space = squares, squares.space
-        self.frames = len(squares.target)
-        objects, directions = squares.target.shape[1:]
-        self.points = 0 if squares.flow is None else squares.flow.shape[2]
-        self.noise = unmeasured(self.frames, objects, directions, self.points)
-        self._known: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-
-    def _distances(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """``squares.distances`` over all frames; what one fit ends with the next begins with, and is not simulated again."""
-        if len(points) == 1 and points.tobytes() in self._known:
-            return self._known[points.tobytes()]
-        reach, flow, bad = self.squares.distances(points, self.frames)
-        if len(points) <= FEW:
-            for k, point in enumerate(points):
-                self._known[point.tobytes()] = reach[k : k + 1], flow[k : k + 1], bad[k : k + 1]
-            while len(self._known) > REMEMBERED:
-                del self._known[next(iter(self._known))]
-        return reach, flow, bad
-
-    def measure_noise(self, point: np.ndarray) -> None:
-        """What the residuals at ``point`` scatter by, and simulations that start next to it."""
-        reach, flow, _ = self._distances(point[None])
-        self.noise = measured(reach[0], flow[0], self.squares.pixels / self.squares.pixel)
-        draws = np.random.default_rng(0).standard_normal((DRAWS, len(point))) * TREMBLE * self.space.sigma
-        self.noise = self.noise.with_scatter(self._standardised(np.clip(point + draws, 0.0, 1.0))[0])
-
-    def _standardised(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        reach, flow, bad = self._distances(points)
-        return slowed(self.noise.standardised(reach, flow).reshape(len(points), -1), CAUCHY), bad
-
-    def __call__(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(robust residuals (B, R), costs (B,))."""
-        robust, bad = self._standardised(points)
-        robust = self.noise.settled(robust)
-        prior = (points - self.space.start) / self.space.sigma
-        cost = 0.5 * (robust**2).sum(-1) + 0.5 * (prior**2).sum(-1)
-        return robust, np.where(bad, np.inf, cost)
-
-    def fit(self, point: np.ndarray, iterations: int = ITERATIONS) -> _Fit:
-        """Levenberg-Marquardt with difference steps that follow the standard errors down."""
-        sigma, size = self.space.sigma, len(point)
-        steps, damping, idle = np.full(size, STEP), 1e-2, 0
-        base, costs = self(point[None])
-        base, cost, covariance = base[0], float(costs[0]), np.eye(size)
-        for iteration in range(iterations):
-            jacobian = self._jacobian(point, base, steps, iteration)
-            gradient = jacobian.T @ base + (point - self.space.start) / sigma
-            curvature = jacobian.T @ jacobian + np.eye(size)
-            covariance = np.linalg.inv(curvature)
-            steps = np.clip(np.sqrt(np.diag(covariance)), LEAST_STEP, STEP)
-            trials = []
-            for factor in damping * TRIALS:
-                step = -np.linalg.solve(curvature + factor * np.diag(np.diag(curvature)), gradient)
-                step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-12))
-                trials.append(np.clip(point + step * sigma, 0.0, 1.0))
-            moved, costs = self(np.array(trials))
-            best = int(np.argmin(costs))
-            gain = cost - float(costs[best])
-            if gain > 0:
-                point, base, cost = trials[best], moved[best], float(costs[best])
-                damping = float(np.clip(damping * TRIALS[best], 1e-8, 1e3))
-            else:
-                damping = min(damping * 1e3, 1e3)
-            idle = idle + 1 if gain < 0.1 else 0
-            if idle == 2:
-                break
-        return _Fit(point, cost, covariance)
-
-    def spread(self, point: np.ndarray, factor: np.ndarray, iterations: int) -> _Fit:
-        """Refines point and spread together; ``factor`` has the spread's principal axes as columns [prior widths]."""
-        base, costs = self(point[None])
-        base, cost = base[0], float(costs[0])
-        for _ in range(iterations):
-            slopes, weights, bent = self._along(point, base, factor)
-            curvature = slopes.T @ (weights[:, None] * slopes)
-            # Slopes of a jagged function are noisy, and squares of noise add up: that much is taken off again. Noise
-            # of variance v in each residual gives slopes v / 2 and bends 3 v / 2.
-            diagonal = np.maximum(np.diag(curvature), 1e-12)
-            kept = np.sqrt(np.maximum(1 - (weights[:, None] * bent**2).sum(0) / (3 * diagonal), 0.1))
-            curvature = curvature * np.outer(kept, kept) + factor.T @ factor
-            gradient = slopes.T @ (weights * base) + factor.T @ ((point - self.space.start) / self.space.sigma)
-            steps = [-factor @ np.linalg.solve(curvature + f * np.eye(len(point)), gradient) for f in RIDGES]
-            steps = [step * min(1.0, 1.0 / max(np.abs(step).max(), 1e-12)) for step in steps]
-            trials = np.clip(point + np.array(steps) * self.space.sigma, 0.0, 1.0)
-            moved, costs = self(trials)
-            best = int(np.argmin(costs))
-            if costs[best] < cost:
-                point, base, cost = trials[best], moved[best], float(costs[best])
-            widths, axes = np.linalg.eigh(curvature)
-            factor = factor @ axes / np.sqrt(np.clip(widths, 1 / 9, 9.0))
-        return _Fit(point, cost, factor @ factor.T)
-
-    def _along(self, point: np.ndarray, base: np.ndarray, factor: np.ndarray):
-        """Slopes (R, D) along the columns of ``factor``, weights (R,) of the residuals, and their bends (R, D)."""
-        sigma, size = self.space.sigma, len(point)
-        ahead = np.clip(point + factor.T * sigma, 0.0, 1.0)
-        behind = np.clip(point - factor.T * sigma, 0.0, 1.0)
-        residuals, _ = self(np.concatenate([ahead, behind]))
-        # At a bound of the box less than the whole distance is gone.
-        gone = np.linalg.norm((ahead - behind) / sigma, axis=1) / np.maximum(2 * np.linalg.norm(factor, axis=0), 1e-12)
-        slopes = ((residuals[:size] - residuals[size:]) / 2 / np.maximum(gone, 0.2)[:, None]).T
-        bent = ((residuals[:size] + residuals[size:]) / 2 - base).T
-        return slopes, 1 / (1 + (bent**2).sum(1)), bent
-
-    def _jacobian(self, point: np.ndarray, base: np.ndarray, steps: np.ndarray, turn: int) -> np.ndarray:
-        """d residuals / d prior widths by one-sided differences, the side alternating from turn to turn, (R, D)."""
-        sigma = self.space.sigma
-        sign = np.where((np.arange(len(point)) + turn) % 2 == 0, 1.0, -1.0)
-        beyond = point + sign * steps * sigma
-        sign = np.where((beyond > 1.0) | (beyond < 0.0), -sign, sign)
-        moved, _ = self(np.clip(point + np.diag(sign * steps * sigma), 0.0, 1.0))
-        return ((moved - base) / (sign * steps)[:, None]).T
-
-
 def _axes(covariance: np.ndarray) -> np.ndarray:
     """Principal axes as columns, a standard deviation long but no shorter than ``LEAST_AXIS``."""
     variances, directions = np.linalg.eigh(covariance)
@@ -273,7 +134,7 @@ def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refi
     from scipy import special  # takes a third of a second to import
 
     before = squares.evaluations
-    posterior = _Posterior(squares)
+    posterior = Posterior(squares)
     space, sigma = squares.space, squares.space.sigma
     for _ in range(2):
         posterior.measure_noise(point)
@@ -291,7 +152,7 @@ def intervals(squares: LeastSquares, point: Float[np.ndarray, "dimension"], refi
         axes = _axes(fits[-1].covariance)
         reach = np.clip(1.0 / np.linalg.norm(axes, axis=0), 1.0, AWAY)
         away = (axes * reach) @ generator.standard_normal(len(point))
-        back = posterior.fit(np.clip(fits[-1].point + away * sigma, 0.0, 1.0), 3)
+        back = posterior.fit(np.clip(fits[-1].point + away * sigma, 0.0, 1.0), 3, 1.3 * axes)
         fits.append(posterior.spread(back.point, 1.3 * axes, REFIT))
     best = min(fits, key=lambda fit: fit.cost)
     within = np.mean([fit.covariance for fit in fits], 0)

@@ -187,6 +187,7 @@ class LeastSquares(Residuals):
             return self._others_stage(point, stage)
         sigma, start = self.space.sigma, self.space.start
         damping = 1.0
+        self._foresee_slopes(point[None], stage.frames)
         base, costs = self.residuals(point[None], stage.frames, stage.scale)
         base, cost = base[0], float(costs[0])
         if self._spent:
@@ -203,6 +204,7 @@ class LeastSquares(Residuals):
             for factor in DAMPINGS * damping:
                 step = self._bounded_step(point, gradient, curvature, factor)
                 trials.append(np.clip(point + step * sigma, 0.0, 1.0))
+            self._foresee_slopes(np.array(trials), stage.frames)
             moved, costs = self.residuals(np.array(trials), stage.frames, stage.scale)
             best = int(np.argmin(costs))
             if not costs[best] < cost:
@@ -219,6 +221,11 @@ class LeastSquares(Residuals):
         if jacobian is None and slopes and not self._spent:
             jacobian = self.jacobian(point, base, stage.frames, stage.scale)
         return point, cost, np.zeros((0, len(point))) if jacobian is None else jacobian
+
+    def _foresee_slopes(self, points: np.ndarray, frames: int) -> None:
+        """Simulates ``points`` and what differences at each of them look at."""
+        if self.automatic is None:
+            self.foresee([points, *(self.beside(point)[0] for point in points)], frames)
 
     def _others_stage(self, point: np.ndarray, stage: Stage) -> tuple[np.ndarray, float, np.ndarray]:
         """One stage by a solver that is not ours."""

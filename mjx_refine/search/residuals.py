@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,9 +25,15 @@ FLOW_SCALE = 2.0
 NOISE_FLOOR = 0.5
 """Standard deviation of a mask's edge [px at a picture 480 wide]."""
 
+STEP = 0.05
+"""Of finite differences [prior widths]."""
+
 EDGE_WEIGHT = float(np.sqrt(6 / DIRECTIONS)) / NOISE_FLOOR
 MOTION_WEIGHT = float(np.sqrt(2 / POINTS)) / FLOW_NOISE
 """Of one direction of an outline, and of one coordinate of the flow at one point [1 / px at a picture 480 wide]."""
+
+Looked = tuple[np.ndarray, np.ndarray | None, np.ndarray]
+"""Reach (B, T, N, directions) and flow (B, T, N, points, 2) of simulations [px], and whether a candidate diverged."""
 
 
 class Residuals:
@@ -45,6 +51,8 @@ class Residuals:
       automatic: derivatives where it has some; None: differences alone.
       fps: frames a second, for effects.
       look: tells reach and flow, as ``seen_reach_and_flow`` does.
+      foresees: whether ``foresee`` simulates ahead: where more candidates in a batch cost next to nothing and another batch
+        its latency, as on a GPU.
     """
 
     def __init__(
@@ -61,8 +69,9 @@ class Residuals:
         automatic: Automatic | None = None,
         fps: float = 30.0,
         look: Look = seen_reach_and_flow,
+        foresees: bool = False,
     ):
-        self.look = look
+        self.look, self.foresees = look, foresees
         self.limit, self.seed, self.solver, self.automatic = limit, seed, solver, automatic
         self.space, self.rollout, self.image, self.fps = space, rollout, image, fps
         self.pixel = image[0] / 480.0
@@ -73,13 +82,43 @@ class Residuals:
         self.target = target
         self.pixels, self.flow = flow_of_objects(flow, columns)
         self.spent = 0.0
+        self._foreseen: dict[tuple[int, bytes], Looked] = {}
+
+    def foresee(self, batches: Sequence[np.ndarray], frames: int) -> None:
+        """Simulates in one batch what ``distances`` will be asked for next, and what it may be asked for after that.
+
+        Nothing where that is slower. Forgotten when it is called again; only what is asked for counts as spent.
+        """
+        known = self._foreseen
+        if not self.foresees or all((frames, batch.tobytes()) in known for batch in batches):
+            return
+        seen, moved, bad = self._looked(np.concatenate(batches), frames)
+        ends = np.cumsum([len(batch) for batch in batches])
+        spans = [slice(end - len(batch), end) for batch, end in zip(batches, ends, strict=True)]
+        # The rows of the first are asked for one by one too.
+        single = [slice(k, k + 1) for k in range(len(batches[0]))]
+        self._foreseen = {
+            (frames, batch.tobytes()): (seen[span], None if moved is None else moved[span], bad[span])
+            for batch, span in zip([*batches, *batches[0][:, None]], [*spans, *single], strict=True)
+        }
 
     def distances(self, points: np.ndarray, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Simulated minus observed reach (B, frames, N, directions) and flow (B, frames, N, 2 * points), both in px at
         480 wide, and whether a candidate diverged."""
+        self.spent += len(points) * frames / len(self.target)
+        foreseen = self._foreseen.get((frames, points.tobytes()))
+        seen, moved, bad = self._looked(points, frames) if foreseen is None else foreseen
+        reach = seen[:, :frames] - self.target[:frames]
+        flow = np.full((len(points), frames, self.target.shape[1], 0), np.nan)
+        if moved is not None and self.flow is not None:
+            moved = moved[:, :frames] - self.flow[:frames]
+            moved[:, frames - 1] = np.nan
+            flow = moved.reshape(*moved.shape[:3], -1)
+        return reach / self.pixel, flow / self.pixel, bad
+
+    def _looked(self, points: np.ndarray, frames: int) -> Looked:
         batch = self.space.decode(points)
         poses = self.rollout(batch, frames)
-        self.spent += len(points) * frames / len(self.target)
         bad = np.logical_not(np.asarray(np.isfinite(poses).all((1, 2, 3))))
         poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
         # The outlines of all frames, so that one length is compiled; those beyond the horizon repeat its last.
@@ -87,13 +126,7 @@ class Residuals:
         poses = np.concatenate([poses, beyond], 1)
         pixels = self.pixels if self.flow is not None and frames > 1 else None
         seen, moved = self.look(poses, batch, pixels, self.image, DIRECTIONS, self.fps)
-        reach = seen[:, :frames] - self.target[:frames]
-        flow = np.full((len(points), frames, len(batch.shapes), 0), np.nan)
-        if moved is not None and self.flow is not None:
-            moved = moved[:, :frames] - self.flow[:frames]
-            moved[:, frames - 1] = np.nan
-            flow = moved.reshape(*moved.shape[:3], -1)
-        return reach / self.pixel, flow / self.pixel, bad
+        return seen, moved, bad
 
     def _robust(self, reach: np.ndarray, flow: np.ndarray, scale: float) -> np.ndarray:
         """Residuals in noise widths, (B, frames, N, directions + 2 * points), zero where nothing was seen.
@@ -125,12 +158,16 @@ class Residuals:
             slopes = self._robust_slopes(base.reshape(columns.shape[1:]), frames, scale)
             result[:, held] = (columns / self.pixel * slopes).reshape(len(columns), -1).T
         if not held.all():
-            step = 0.05 * self.space.sigma
-            sign = np.where(point + step > 1.0, -1.0, 1.0)
-            points = (point + np.diag(sign * step))[~held]
-            moved, _ = self.residuals(np.clip(points, 0.0, 1.0), frames, scale)
-            result[:, ~held] = ((moved - base) / (sign[~held, None] * 0.05)).T
+            points, sign = self.beside(point)
+            moved, _ = self.residuals(points[~held], frames, scale)
+            result[:, ~held] = ((moved - base) / (sign[~held, None] * STEP)).T
         return result
+
+    def beside(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The points (D, D) that differences at ``point`` look at, and to which side (D,) each lies."""
+        step = STEP * self.space.sigma
+        sign = np.where(point + step > 1.0, -1.0, 1.0)
+        return np.clip(point + np.diag(sign * step), 0.0, 1.0), sign
 
     def _robust_slopes(self, base: np.ndarray, frames: int, scale: float) -> np.ndarray:
         """Derivatives of ``_robust`` in the raw distances, told from its own values; zero where nothing was seen."""

@@ -180,6 +180,7 @@ class Run:
             solver=self.options.solver,
             fps=reference.fps,
             look=self.engines.look(start.scene, space.dimension),
+            foresees=self.engines.on_device(start.scene, space.dimension),
         )
 
     def _beginning(self) -> Beginning:

@@ -14,7 +14,7 @@ from mjx_refine.scene import Shape
 from mjx_refine.view.outline import padded, support_function
 from mjx_refine.view.points import point_flow_function
 
-ROWS = (8, 64, 128)
+ROWS = (8, 64, 128, 256, 512)
 """Batch sizes that are compiled; larger batches are multiples of the last."""
 
 

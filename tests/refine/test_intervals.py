@@ -12,6 +12,7 @@ from mjx_refine import Options, refine
 from mjx_refine.observation import Observation
 from mjx_refine.search.features import flow_points
 from mjx_refine.search.intervals import intervals
+from mjx_refine.search.schedule import stages
 from mjx_refine.space import Space
 
 FRAMES = 16
@@ -134,3 +135,19 @@ def test_what_is_not_fitted_widens_errors():
     assert lost.misfit[0] > 3
     assert (lost.standard_error[fitted.determined] > 1.5 * fitted.standard_error[fitted.determined]).all()
     assert lost.determined.sum() < fitted.determined.sum()
+
+
+def test_looking_ahead_changes_no_number_and_asks_less_often():
+    told = []
+    for foresees in (False, True):
+        # Without flow: its last bits depend on the size of a batch.
+        clip = Clip(3)
+        squares, calls = clip.squares(clip.start, foresees=foresees), []
+        squares.rollout = lambda batch, frames, r=clip.rollout, c=calls: c.append(len(batch)) or r(batch, frames)
+        point = squares.run(clip.space.start, stages(FRAMES), hops=1).point
+        told.append((intervals(squares, point, 2, 0), squares.evaluations, len(calls)))
+    (plain, spent, often), (ahead, same, seldom) = told
+    assert seldom < 0.65 * often
+    assert same == spent
+    for field in dataclasses.fields(plain):
+        np.testing.assert_array_equal(getattr(plain, field.name), getattr(ahead, field.name))
