@@ -109,9 +109,13 @@ def check_sizes(path: Path) -> None:
     """Refuses headers that promise more than memory holds, before anything is read."""
     try:
         if path.is_dir():
-            raise InputError(f"{path}: is a directory; expected an observation (npz with flow, masks, fps)")
+            raise InputError(
+                f"{path}: is a directory; expected an observation (npz with flow, masks, fps); name the file in it"
+            )
         if not path.is_file():
-            raise InputError(f"{path}: no such file; expected an observation (npz with flow, masks, fps)")
+            raise InputError(
+                f"{path}: no such file; expected an observation (npz with flow, masks, fps); check the name"
+            )
         with zipfile.ZipFile(path) as archive:
             need = sum(_declared_bytes(path, archive, info) for info in archive.infolist())
     except InputError:
@@ -161,18 +165,22 @@ def make_observation(
     """
     flow = np.asarray(flow)
     if flow.dtype.kind != "f":
-        raise InputError(f"{source}: flow has dtype {flow.dtype}; expected float16, float32 or float64")
+        raise InputError(
+            f"{source}: flow has dtype {flow.dtype}; expected float16, float32 or float64; convert it with astype"
+        )
     if flow.ndim != 4 or flow.shape[3] != 2:
-        raise InputError(f"{source}: flow has shape {flow.shape}; expected (T-1, H, W, 2)")
+        raise InputError(f"{source}: flow has shape {flow.shape}; expected (T-1, H, W, 2); add or move axes")
     if min(flow.shape) < 1:
         raise InputError(
-            f"{source}: flow has shape {flow.shape}; expected at least two frames (one interval) of pixels"
+            f"{source}: flow has shape {flow.shape}; expected at least two frames (one interval) of pixels; give a longer clip"
         )
     intervals, height, width = flow.shape[:3]
     if min(height, width) < 8:
-        raise InputError(f"{source}: frames of {width}x{height}; expected at least 8x8 pixels")
+        raise InputError(f"{source}: frames of {width}x{height}; expected at least 8x8 pixels; give larger pictures")
     if np.isinf(flow).any():
-        raise InputError(f"{source}: flow holds infinities; expected finite numbers, or NaN where it was not measured")
+        raise InputError(
+            f"{source}: flow holds infinities; expected finite numbers; write NaN where it was not measured"
+        )
     if flow.dtype.itemsize > 2 and (np.abs(flow) > MAX_FLOW).any():  # float16 ends below
         raise InputError(
             f"{source}: flow holds displacements of {np.nanmax(np.abs(flow)):.3g} px/frame; expected at most {MAX_FLOW:g}; "
@@ -195,7 +203,9 @@ def make_observation(
 def _fps(fps: float | np.ndarray, source: str) -> float:
     array = np.asarray(fps)
     if array.size != 1 or array.dtype.kind not in "fiu":
-        raise InputError(f"{source}: fps has shape {array.shape} and dtype {array.dtype}; expected one number")
+        raise InputError(
+            f"{source}: fps has shape {array.shape} and dtype {array.dtype}; expected one number; give frames a second"
+        )
     value = float(array.reshape(()))
     if not 0.1 <= value <= 1e5:
         raise InputError(f"{source}: fps = {value:g}; expected 0.1 <= fps <= 100000 frames a second; correct it")
@@ -204,34 +214,49 @@ def _fps(fps: float | np.ndarray, source: str) -> float:
 
 def _masks(masks: np.ndarray, shape: tuple[int, ...], source: str) -> np.ndarray:
     if masks.dtype.kind not in "iub":
-        raise InputError(f"{source}: masks have dtype {masks.dtype}; expected integer ids (0 = background)")
+        raise InputError(
+            f"{source}: masks have dtype {masks.dtype}; expected integer ids (0 = background); convert them with astype(int)"
+        )
     if masks.shape != shape:
-        raise InputError(f"{source}: masks have shape {masks.shape}; expected {shape} (one frame more than the flow)")
+        raise InputError(
+            f"{source}: masks have shape {masks.shape}; expected {shape} (one frame more than the flow); cut the longer one"
+        )
     if masks.dtype.kind != "b" and (masks.min() < 0 or masks.max() > 2**30):
-        raise InputError(f"{source}: mask ids lie in [{masks.min()}, {masks.max()}]; expected 0 <= id <= 2^30")
+        raise InputError(
+            f"{source}: mask ids lie in [{masks.min()}, {masks.max()}]; expected 0 <= id <= 2^30; number the objects anew"
+        )
     if not masks.any():
         raise InputError(
             f"{source}: masks are empty in every frame; expected at least one object; see `refine observe`"
         )
     if len(np.unique(masks)) > 65:
-        raise InputError(f"{source}: masks hold {len(np.unique(masks)) - 1} ids; expected at most 64 objects")
+        raise InputError(
+            f"{source}: masks hold {len(np.unique(masks)) - 1} ids; expected at most 64 objects; set the others to 0"
+        )
     return masks.astype(np.int32)
 
 
 def _frames(frames: np.ndarray, shape: tuple[int, ...], source: str) -> np.ndarray:
     if frames.dtype != np.uint8 or frames.shape != shape:
-        raise InputError(f"{source}: frames are {frames.dtype} {frames.shape}; expected uint8 {shape}")
+        raise InputError(
+            f"{source}: frames are {frames.dtype} {frames.shape}; expected uint8 {shape}; convert or cut them, or leave them out"
+        )
     return frames
 
 
 def _sigma(sigma: np.ndarray, shape: tuple[int, ...], source: str) -> float | np.ndarray:
     if sigma.dtype.kind not in "fiu" or sigma.shape not in ((), shape):
-        raise InputError(f"{source}: flow_sigma is {sigma.dtype} {sigma.shape}; expected one number or shape {shape}")
+        raise InputError(
+            f"{source}: flow_sigma is {sigma.dtype} {sigma.shape}; expected one number or shape {shape}; give one number"
+        )
     if not (sigma[np.isfinite(sigma)] >= 0).all() or not np.isfinite(sigma).any():
-        raise InputError(f"{source}: flow_sigma holds negative or no finite numbers; expected pixels >= 0")
+        raise InputError(
+            f"{source}: flow_sigma holds negative or no finite numbers; expected pixels >= 0; write NaN where it is not known"
+        )
     if (sigma[np.isfinite(sigma)].astype(np.float64) > MAX_FLOW).any():
         raise InputError(
-            f"{source}: flow_sigma holds {sigma[np.isfinite(sigma)].max():.3g}; expected at most {MAX_FLOW:g}"
+            f"{source}: flow_sigma holds {sigma[np.isfinite(sigma)].max():.3g}; expected at most {MAX_FLOW:g}; "
+            "write NaN where it is not known"
         )
     return float(sigma) if sigma.ndim == 0 else sigma.astype(np.float32)
 

@@ -85,7 +85,10 @@ def load_jobs(path: str | os.PathLike) -> list[Job]:
     path = Path(path)
     entries = load_plain(read_text(path, "a list of jobs in YAML"), str(path), "it")
     if isinstance(entries, str | bytes | Mapping) or not isinstance(entries, Sequence) or not entries:
-        raise InputError(f"{path}: got {fields.show(entries)}; expected a list of jobs, each with `init` and `video`")
+        raise InputError(
+            f"{path}: got {fields.show(entries)}; expected a list of jobs, each with `init` and `video`; "
+            "begin each with `- init: ...`"
+        )
     if len(entries) > MAX_JOBS:
         raise InputError(f"{path}: {len(entries)} jobs; expected at most {MAX_JOBS}; split the file")
     jobs = [_job(entry, path, f"{path}: job {i}") for i, entry in enumerate(entries)]

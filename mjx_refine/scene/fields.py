@@ -36,7 +36,9 @@ def mapping(value: object, place: str, allowed: Iterable[str]) -> Mapping[str, A
     """``value`` as a mapping with only ``allowed`` keys."""
     allowed = tuple(allowed)
     if not isinstance(value, Mapping):
-        raise InputError(f"{place} = {show(value)}; expected a mapping with the keys {', '.join(allowed)}")
+        raise InputError(
+            f"{place} = {show(value)}; expected a mapping with the keys {', '.join(allowed)}; write `key: value` for each"
+        )
     for key in value:
         if key not in allowed:
             raise InputError(
@@ -64,7 +66,7 @@ def number(
     if is_number_text(value):
         value = float(value)  # type: ignore[arg-type]
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{place} = {show(value)}; {expectation}")
+        raise InputError(f"{place} = {show(value)}; {expectation}; correct the value")
     try:
         result = float(value)
     except OverflowError:
@@ -77,7 +79,7 @@ def number(
 def vector(value: object, place: str, length: int, low: float = -1e6, high: float = 1e6, *, above: bool = False) -> Any:
     """``value`` as a tuple of ``length`` numbers in [low, high]."""
     if isinstance(value, str | bytes) or not isinstance(value, Sequence) or len(value) != length:
-        raise InputError(f"{place} = {show(value)}; expected a list of {length} numbers")
+        raise InputError(f"{place} = {show(value)}; expected a list of {length} numbers; give them as [..., ...]")
     return tuple(number(v, f"{place}[{i}]", low, high, above=above) for i, v in enumerate(value))
 
 
@@ -93,7 +95,7 @@ def text(value: object, place: str) -> str:
     if isinstance(value, int | float) and not isinstance(value, bool):
         value = str(value)
     if not isinstance(value, str) or not value.strip() or len(value) > 200 or not value.isprintable():
-        raise InputError(f"{place} = {show(value)}; expected a printable text of 1 to 200 characters")
+        raise InputError(f"{place} = {show(value)}; expected a printable text of 1 to 200 characters; rename it")
     if "<answer>" in value or "<think>" in value:
         raise InputError(f"{place} = {show(value)}; expected a text without <answer> and <think>; rename it")
     return value.strip()

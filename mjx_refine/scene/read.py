@@ -69,7 +69,9 @@ def parse_scenes(text: str, source: str = "<text>") -> Samples:
     """
     texts = sample_texts(text)
     if not texts:
-        raise InputError(f"{source}: no scene in it; expected a YAML list of entries (objects, camera, gravity)")
+        raise InputError(
+            f"{source}: no scene in it; expected a YAML list of entries (objects, camera, gravity); write one"
+        )
     if len(texts) > MAX_SAMPLES:
         raise InputError(f"{source}: {len(texts)} samples; expected at most {MAX_SAMPLES}; remove some")
     scenes: list[Scene] = []
@@ -118,7 +120,9 @@ def scene_from_entries(entries: object, place: str = "<scene>") -> Scene:
       InputError: an entry is wrong; the message names entry and key.
     """
     if isinstance(entries, Mapping) or isinstance(entries, str | bytes) or not isinstance(entries, Sequence):
-        raise InputError(f"{place}: got {fields.show(entries)}; expected a list of entries, each with a `type`")
+        raise InputError(
+            f"{place}: got {fields.show(entries)}; expected a list of entries, each with a `type`; begin each with `- type: ...`"
+        )
     objects: list[Body] = []
     cameras: list[Camera] = []
     gravities: list[tuple[float, float, float]] = []
@@ -126,7 +130,9 @@ def scene_from_entries(entries: object, place: str = "<scene>") -> Scene:
     for i, entry in enumerate(entries):
         where = f"{place}: entry {i}"
         if not isinstance(entry, Mapping):
-            raise InputError(f"{where} = {fields.show(entry)}; expected a mapping with a `type`")
+            raise InputError(
+                f"{where} = {fields.show(entry)}; expected a mapping with a `type`; write `- type: ...` and its keys below"
+            )
         kind = fields.required(entry, "type", where)
         if isinstance(kind, str) and kind in SHAPES:
             objects.append(_body(entry, where, kind, len(objects)))
@@ -139,7 +145,7 @@ def scene_from_entries(entries: object, place: str = "<scene>") -> Scene:
             effects.append(_effect(entry, where))
         else:
             expected = ", ".join((*SHAPES, "camera", "gravity", "effect"))
-            raise InputError(f"{where}.type = {fields.show(kind)}; expected one of {expected}")
+            raise InputError(f"{where}.type = {fields.show(kind)}; expected one of {expected}; correct the type")
     _check_counts(objects, cameras, gravities, effects, place)
     return Scene(tuple(objects), cameras[0], gravities[0] if gravities else Scene.gravity, tuple(effects))
 
@@ -150,9 +156,12 @@ def _check_counts(objects: list, cameras: list, gravities: list, effects: list[E
     if len(objects) > 64:
         raise InputError(f"{place}: {len(objects)} objects; expected at most 64; remove some")
     if len(cameras) != 1:
-        raise InputError(f"{place}: {len(cameras)} entries of type camera; expected exactly one")
+        raise InputError(
+            f"{place}: {len(cameras)} entries of type camera; expected exactly one; "
+            f"{'remove the others' if cameras else 'add one'}"
+        )
     if len(gravities) > 1:
-        raise InputError(f"{place}: {len(gravities)} entries of type gravity; expected at most one")
+        raise InputError(f"{place}: {len(gravities)} entries of type gravity; expected at most one; remove the others")
     names = [body.name for body in objects]
     for name in names:
         if names.count(name) > 1:
@@ -163,7 +172,7 @@ def _check_counts(objects: list, cameras: list, gravities: list, effects: list[E
         if effect.target is not None and effect.target not in names:
             raise InputError(
                 f"{place}: effect {effect.effect}.target = {effect.target!r}; "
-                f"expected an object's name: {fields.cut(', '.join(names))}"
+                f"expected an object's name: {fields.cut(', '.join(names))}; correct the target"
             )
 
 
@@ -209,7 +218,9 @@ def _size(entry: Mapping[str, Any], where: str, shape: str) -> tuple[float, ...]
 def _quaternion(value: tuple[float, ...], place: str) -> Quaternion:
     norm = math.sqrt(sum(v * v for v in value))
     if norm < 1e-6:
-        raise InputError(f"{place} = {list(value)}; expected a quaternion w x y z that is not zero")
+        raise InputError(
+            f"{place} = {list(value)}; expected a quaternion w x y z that is not zero; [1, 0, 0, 0] is no rotation"
+        )
     # Dividing an already normalised quaternion again would change its last digit.
     scale = 1.0 if abs(norm - 1.0) < 1e-12 else norm
     return cast(Quaternion, tuple(v / scale for v in value))
@@ -232,7 +243,9 @@ def _effect(entry: Mapping[str, Any], where: str) -> Effect:
     target = entry.get("target")
     raw = {} if entry.get("parameters") is None else entry["parameters"]
     if not isinstance(raw, Mapping):
-        raise InputError(f"{where}.parameters = {fields.show(raw)}; expected a mapping of names to numbers")
+        raise InputError(
+            f"{where}.parameters = {fields.show(raw)}; expected a mapping of names to numbers; write `name: number` for each"
+        )
     parameters = []
     for key, value in raw.items():
         place = f"{where}.parameters.{key}"
