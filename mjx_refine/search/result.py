@@ -67,7 +67,7 @@ class RefineResult:
       known: intervals, free directions and the noise that was estimated; None if no refits were made.
       fixed: (name, reason) of what no search could tell.
       history: a row a step.
-      evaluations: rollouts spent, in units of the whole clip.
+      evaluations: rollouts spent, in units of the whole clip; what a GPU simulated ahead and nobody asked for is not counted.
       reason: why the search ended.
       backend, device: what searched; the scores are always C MuJoCo's.
       seconds: total, compile, search.
