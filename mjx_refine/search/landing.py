@@ -200,12 +200,10 @@ class LeastSquares(Residuals):
                 jacobian = self.jacobian(point, base, stage.frames, stage.scale)
             gradient = jacobian.T @ base + (point - start) / sigma
             curvature = jacobian.T @ jacobian + np.eye(len(point))
-            trials = []
-            for factor in DAMPINGS * damping:
-                step = self._bounded_step(point, gradient, curvature, factor)
-                trials.append(np.clip(point + step * sigma, 0.0, 1.0))
-            self._foresee_slopes(np.array(trials), stage.frames)
-            moved, costs = self.residuals(np.array(trials), stage.frames, stage.scale)
+            steps = [self._bounded_step(point, gradient, curvature, factor) for factor in DAMPINGS * damping]
+            trials = np.clip(point + np.array(steps) * sigma, 0.0, 1.0)
+            self._foresee_slopes(trials, stage.frames)
+            moved, costs = self.residuals(trials, stage.frames, stage.scale)
             best = int(np.argmin(costs))
             if not costs[best] < cost:
                 if damping > 1e4:
@@ -225,7 +223,7 @@ class LeastSquares(Residuals):
     def _foresee_slopes(self, points: np.ndarray, frames: int) -> None:
         """Simulates ``points`` and what differences at each of them look at."""
         if self.automatic is None:
-            self.foresee([points, *(self.beside(point)[0] for point in points)], frames)
+            self.foresee(points, (self.beside(point)[0] for point in points), frames)
 
     def _others_stage(self, point: np.ndarray, stage: Stage) -> tuple[np.ndarray, float, np.ndarray]:
         """One stage by a solver that is not ours."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_refine.search.landing import LeastSquares
 from mjx_refine.search.noise import DRAWS, TREMBLE, measured, unmeasured
@@ -30,9 +31,9 @@ FEW, REMEMBERED = 8, 64
 class Fit:
     """Where a fit ended (unit box), its half sum of squares, its covariance [prior widths squared]."""
 
-    point: np.ndarray
+    point: Float[np.ndarray, "dimension"]
     cost: float
-    covariance: np.ndarray
+    covariance: Float[np.ndarray, "dimension dimension"]
 
 
 class Posterior:
@@ -63,13 +64,10 @@ class Posterior:
         draws = np.random.default_rng(0).standard_normal((DRAWS, len(point))) * TREMBLE * self.space.sigma
         draws = np.clip(point + draws, 0.0, 1.0)
         # A fit from there is what mostly follows.
-        self._foresee([point[None], draws, self._stepped(point, np.full(len(point), STEP), 0)[0]])
+        self.squares.foresee(point[None], (draws, self._stepped(point, np.full(len(point), STEP), 0)[0]), self.frames)
         reach, flow, _ = self._distances(point[None])
         self.noise = measured(reach[0], flow[0], self.squares.pixels / self.squares.pixel)
         self.noise = self.noise.with_scatter(self._standardised(draws)[0])
-
-    def _foresee(self, batches: list[np.ndarray]) -> None:
-        self.squares.foresee(batches, self.frames)
 
     def _standardised(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         reach, flow, bad = self._distances(points)
@@ -88,7 +86,7 @@ class Posterior:
         comes next, if they are known."""
         sigma, size = self.space.sigma, len(point)
         steps, damping, idle = np.full(size, STEP), 1e-2, 0
-        self._foresee([point[None], self._stepped(point, steps, 0)[0]])
+        self.squares.foresee(point[None], (self._stepped(point, steps, 0)[0],), self.frames)
         base, costs = self(point[None])
         base, cost, covariance = base[0], float(costs[0]), np.eye(size)
         for iteration in range(iterations):
@@ -102,12 +100,15 @@ class Posterior:
                 step = -np.linalg.solve(curvature + factor * np.diag(np.diag(curvature)), gradient)
                 step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-12))
                 trials.append(np.clip(point + step * sigma, 0.0, 1.0))
+            trials = np.array(trials)
+            # Where the next step is taken from: a trial, or again from here.
+            ends = [*trials, point]
             if iteration + 1 < iterations:
-                after = [self._stepped(end, steps, iteration + 1)[0] for end in (*trials, point)]
+                after = (self._stepped(end, steps, iteration + 1)[0] for end in ends)
             else:
-                after = [] if axes is None else [self._astride(end, axes) for end in (*trials, point)]
-            self._foresee([np.array(trials), *after])
-            moved, costs = self(np.array(trials))
+                after = (self._astride(end, axes) for end in ends if axes is not None)
+            self.squares.foresee(trials, after, self.frames)
+            moved, costs = self(trials)
             best = int(np.argmin(costs))
             gain = cost - float(costs[best])
             if gain > 0:
@@ -139,7 +140,7 @@ class Posterior:
             widths, axes = np.linalg.eigh(curvature)
             factor = factor @ axes / np.sqrt(np.clip(widths, 1 / 9, 9.0))
             ends = (*trials, point) if iteration + 1 < iterations else ()
-            self._foresee([trials, *(self._astride(end, factor) for end in ends)])
+            self.squares.foresee(trials, (self._astride(end, factor) for end in ends), self.frames)
             moved, costs = self(trials)
             best = int(np.argmin(costs))
             if costs[best] < cost:
