@@ -36,11 +36,12 @@ def main() -> None:
 @click.option("--strange", type=click.IntRange(0), default=COUNTS["strange"], show_default=True)
 @click.option("--only", default="", help="Effects to keep to, parted by commas.")
 @click.option("--clips", type=click.IntRange(1, 9), default=1, show_default=True, help="Of each set-up.")
+@click.option("--left", type=click.FloatRange(0), default=0.0, help="Px that a refit must leave of every effect.")
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True)
-def make(seed: int, out: Path, only: str, clips: int, jobs: int, **counts: int) -> None:
+def make(seed: int, out: Path, only: str, clips: int, left: float, jobs: int, **counts: int) -> None:
     """Makes clips and their keys; those that are there already are left alone."""
     try:
-        listed = plan.orders(seed, counts, tuple(n for n in only.split(",") if n), clips)
+        listed = plan.orders(seed, counts, tuple(n for n in only.split(",") if n), clips, left)
     except ValueError as error:
         raise click.UsageError(str(error)) from error
     missing = [(i, o) for i, o in enumerate(listed) if not (out / "key" / f"{i:03d}.json").exists()]
@@ -54,6 +55,7 @@ def make(seed: int, out: Path, only: str, clips: int, jobs: int, **counts: int) 
         "splits": dict(Counter(o.split for o in listed)),
         "effects": dict(Counter(e for o in listed for e in o.effects)),
         "flow": dict(Counter(o.flow for o in listed)),
+        "left": left,
     }
     (out / "key").mkdir(exist_ok=True)
     write_text(out / "key" / "exam.json", json.dumps(summary, indent=1) + "\n")
@@ -74,10 +76,10 @@ def answer(folder: Path, out: Path, alone: bool, jobs: int) -> None:
         raise click.ClickException(f"{failed} diagnoses failed; see log.txt in their folders, and call again")
 
 
-@main.command()
+@main.command("left")
 @click.argument("folder", metavar="EXAM", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--jobs", type=click.IntRange(1), default=1, show_default=True)
-def left(folder: Path, jobs: int) -> None:
+def measure_left(folder: Path, jobs: int) -> None:
     """Measures what a refit of the scene leaves of every effect's size, into left.json; goes on where it stopped."""
     faults = 0
     try:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from benchmarks.clips.writing import scene_text
-from benchmarks.withheld import masks, several, solve, start
+from benchmarks.withheld import left, masks, several, solve, start
 from benchmarks.withheld.effect import Effect, named
 from benchmarks.withheld.film import Film, measured_flow, paint, picture
 from benchmarks.withheld.solve import FAMILIES, Solved
@@ -30,22 +30,25 @@ ATTEMPTS = 600
 
 @dataclass(frozen=True)
 class Order:
-    """What a clip is to hold: its split, effects, flow (`exact` or `dis`), seed, and how many clips of the set-up."""
+    """What a clip is to hold: its split, effects, flow (`exact` or `dis`), seed, how many clips of the set-up, and how much of
+    each effect a refit of the scene without it must leave [px] (`left.left`)."""
 
     split: str
     effects: tuple[str, ...]
     flow: str
     seed: tuple[int, int]
     clips: int = 1
+    left: float = 0.0
 
 
 @dataclass(frozen=True)
 class Take:
-    """A clip that passed every filter."""
+    """A clip that passed every filter; lefts: what a refit leaves of each effect [px], where that was asked for."""
 
     stage: Stage
     film: Film
     solved: tuple[Solved, ...]
+    lefts: tuple[float, ...] = ()
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -61,9 +64,12 @@ def find(order: Order) -> tuple[Take, np.random.Generator]:
     """
     rng = np.random.default_rng(order.seed)
     reasons: dict[str, int] = {}
-    for _ in range(ATTEMPTS):
+    for attempt in range(ATTEMPTS):
         stage = start.draw_stage(rng, order.effects)
         found = _attempt(rng, stage, order.effects)
+        if isinstance(found, Take) and order.left:
+            # A generator of its own: the clip is the one that would be drawn anyway.
+            found = _leaving(found, order.left, np.random.default_rng([*order.seed, 5, attempt]))
         if isinstance(found, Take):
             return found, rng
         reasons[found] = reasons.get(found, 0) + 1
@@ -91,6 +97,12 @@ def _attempt(rng: np.random.Generator, stage: Stage, names: tuple[str, ...]) -> 
     take = Take(stage, film, tuple(solved))
     idle = [name for k, name in enumerate(names) if not _acts(take, k)]
     return f"{idle[0]} hardly acts" if idle else take
+
+
+def _leaving(take: Take, least: float, rng: np.random.Generator) -> Take | str:
+    """The take with what a refit leaves of each of its effects, or why that is not enough."""
+    lefts = left.lefts(take.stage, take.effects, least, rng)
+    return replace(take, lefts=lefts) if lefts is not None else "a refit leaves too little"
 
 
 def window(take: Take, index: int) -> tuple[int, int] | None:
@@ -201,6 +213,7 @@ def key(order: Order, take: Take, mask_ids: list[int]) -> dict[str, Any]:
                 "hidden": effect.hidden,
                 "px": round(solved.px, 3),
                 "px_target": round(solved.target, 3),
+                "px_left": round(take.lefts[index], 3) if take.lefts else None,
                 "px_objects": round(solve.displacement(take.stage, effect, "objects"), 3)
                 if FAMILIES[effect.name].seen in ("objects", "picture")
                 else None,

@@ -109,6 +109,25 @@ def left(
     }
 
 
+def lefts(
+    stage: Stage, effects: tuple[Effect, ...], least: float, rng: np.random.Generator
+) -> tuple[float, ...] | None:
+    """What is left of each effect [px], the others being known; None as soon as some refit leaves less than `least` of one."""
+    found = []
+    with engine() as opened:
+        for k, effect in enumerate(effects):
+            known = (*effects[:k], *effects[k + 1 :])
+            floor = background(stage, (*known, effect), known)
+            if floor >= least:  # of what no number of the scene moves nothing is taken up
+                found.append(floor)
+                continue
+            end = refit.best(refit.Refit(opened, stage, effects, known), rng, least)[0]
+            if max(end.reach, floor) < least:
+                return None
+            found.append(max(end.reach, floor))
+    return tuple(found)
+
+
 def left_of(path: Path) -> dict[str, Any]:
     """What is left of a clip's effects, together and each by itself, the others being known; or why it cannot be told.
 

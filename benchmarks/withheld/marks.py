@@ -47,9 +47,9 @@ class Mark:
         verdict declares it indistinguishable from its own first. object_right, frames_right, since_right: of the place,
         None where no place is asked for; `since` counts all frames from the first on.
       closed: of the gap, None where the file has none. errors: of the parameters by "effect: parameter".
-      px: largest displacement. lefts: what is left of each effect's once the scene has been refitted (`left.py`), px; empty where
-        it has not been measured. rank: place of the right name among the candidates, from 1, None where it is not there or
-        there is not one right name. flow, kind: of the clip. seconds, peak_mb: of the diagnosis.
+      px: largest displacement. lefts: what is left of each effect once the scene has been refitted, px (of `left.py`, or
+        the key); empty where it has not been measured. rank: place of the right name among the candidates, from 1, None
+        where it is not there or there is not one right name. flow, kind: of the clip. seconds, peak_mb: of the diagnosis.
     """
 
     clip: str
@@ -118,9 +118,15 @@ def mark(
         seconds=float(ran["seconds"]),
         peak_mb=float(ran["peak_mb"]),
         errors=_errors(key, diagnosis, said) if split in ("one", "two") else {},
-        lefts=tuple(float(effect["px_left"]) for effect in left["effects"]) if left else (),
+        lefts=_lefts(left["effects"] if left else key["effects"]),
         rank=candidates.index(truth[0]) + 1 if split == "one" and truth[0] in candidates else None,
     )
+
+
+def _lefts(effects: list[dict[str, Any]]) -> tuple[float, ...]:
+    """What is left of each effect; empty where it was not measured."""
+    told = [effect.get("px_left") for effect in effects]
+    return tuple(float(px) for px in told if px is not None)
 
 
 def _wanted(split: str, truth: tuple[str, ...], accepts: tuple[str, ...]) -> list[tuple[str, ...]]:

@@ -11,13 +11,15 @@ from benchmarks.withheld.several import LASTING
 SPLITS = ("one", "two", "none", "withheld", "strange")
 
 
-def orders(seed: int, counts: dict[str, int], only: tuple[str, ...] = (), clips: int = 1) -> list[Order]:
+def orders(
+    seed: int, counts: dict[str, int], only: tuple[str, ...] = (), clips: int = 1, left: float = 0.0
+) -> list[Order]:
     """The clips of an exam, shuffled.
 
     Args:
       seed: the same seed gives the same exam. counts: clips of each split. only: effects of the catalogue to keep to
         (of pairs: those both of whose effects are among them, if there are any). clips: of each set-up; of several, only
-        effects that last are drawn.
+        effects that last are drawn. left: what a refit of the scene without an effect must leave of it, px.
 
     Raises:
       ValueError: an unknown split or effect.
@@ -43,4 +45,4 @@ def orders(seed: int, counts: dict[str, int], only: tuple[str, ...] = (), clips:
             drawn += [pool[i] for i in rng.permutation(len(pool))]
         flows = rng.permutation(["exact", "dis"] * ((count + 1) // 2))[:count]
         found += [(split, tuple(e), str(f)) for e, f in zip(drawn[:count], flows, strict=True)]
-    return [Order(*found[i], seed=(seed, int(i)), clips=clips) for i in rng.permutation(len(found))]
+    return [Order(*found[i], seed=(seed, int(i)), clips=clips, left=left) for i in rng.permutation(len(found))]

@@ -12,7 +12,7 @@ pytest.importorskip("pybullet", reason="the exam needs the bench extra")
 from click.testing import CliRunner
 
 from benchmarks.withheld import __main__ as commands
-from benchmarks.withheld import left, masks, physics, refit, solve, start
+from benchmarks.withheld import exam, left, masks, physics, plan, refit, solve, start
 from benchmarks.withheld.base import Base
 from benchmarks.withheld.effect import Effect
 from benchmarks.withheld.stage import Stage
@@ -138,6 +138,44 @@ def test_less_gravity_takes_up_part_of_a_drag(monkeypatch):
     assert found["shifts"]
     assert found["cost"] == pytest.approx(min(found["costs"]), abs=0.1)
     assert whole["px_left"] == pytest.approx(solve.displacement(alone, SHAKE, "picture"), abs=1e-3)
+
+
+def test_least_is_asked_of_every_effect():
+    alone = Stage(scene(BALL), "flight")
+    pan = Effect("camera_motion", None, {"pan": 2.0, "tilt": 0.0, "x": 0.0, "y": 0.0, "z": 0.0})
+
+    def found(effects, least):
+        return left.lefts(alone, effects, least, np.random.default_rng(0))
+
+    floor = left.background(alone, (pan,))
+    assert floor > 5
+    # No refit is looked for where the floor tells enough.
+    assert found((pan,), 5.0) == (floor,)
+    # A fall with drag is nearly one with less gravity, whatever moves the camera.
+    assert found((pan, DRAG), 5.0) is None
+    assert found((pan, DRAG), 0.01) is not None
+
+
+def test_an_exam_of_effects_that_leave_something(monkeypatch):
+    order = plan.orders(3, {"one": 1}, ("drag",), left=3.0)[0]
+    assert order.left == 3.0
+    asked, tries = [], iter([None, None, (4.5,)])
+
+    def lefts(stage, effects, least, rng):
+        asked.append((effects[0].name, least, float(rng.random())))
+        return next(tries)
+
+    monkeypatch.setattr(left, "lefts", lefts)
+    take, _ = exam.find(order)
+    assert take.lefts == (4.5,)
+    assert [told[:2] for told in asked] == [("drag", 3.0)] * 3
+    assert len({told[2] for told in asked}) == 3
+    told = exam.key(order, take, [1])["effects"][0]
+    assert told["px_left"] == 4.5
+    monkeypatch.setattr(left, "lefts", lambda *_: None)
+    monkeypatch.setattr(exam, "ATTEMPTS", 3)
+    with pytest.raises(ValueError, match="a refit leaves too little"):
+        exam.find(order)
 
 
 def test_what_an_occluder_hides_is_not_explained():

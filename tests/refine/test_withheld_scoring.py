@@ -203,6 +203,15 @@ def test_report_by_hand(tmp_path):
     ):
         assert line in more
     assert set(text.splitlines()) - set(more.splitlines()) == {"| 001 | push | 30.0 |  | drag | - |"}
+    # What the key tells is taken where nothing was measured afterwards.
+    (tmp_path / "exam/left.json").unlink()
+    for clip, each in lefts.items():
+        path = tmp_path / f"exam/key/{clip}.json"
+        key = json.loads(path.read_text())
+        for effect, px in zip(key["effects"], each, strict=True):
+            effect["px_left"] = px
+        path.write_text(json.dumps(key))
+    assert score.report(score.marks(tmp_path / "exam", tmp_path / "out")) == more
     (tmp_path / "out/003/diagnosis.json").write_text('{"format": 1}')
     with pytest.raises(ValueError, match=r"003/diagnosis\.json: KeyError 'verdict'"):
         score.marks(tmp_path / "exam", tmp_path / "out")
