@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from mjx_refine.children import cores
 from mjx_refine.compile_cache import enable_cache
+from mjx_refine.diagnosis.candidates import Candidate, Compared
 from mjx_refine.diagnosis.crew import Crew, crew_of
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import HeldOut, held_out
@@ -20,7 +21,8 @@ from mjx_refine.diagnosis.hypothesis import Term
 from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.replay import Replay, replays
 from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Value, Verdict
-from mjx_refine.diagnosis.search import Candidate, Compared, compare, view_of
+from mjx_refine.diagnosis.search import compare
+from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.diagnosis.store import Store
 from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, map_of, signs, upheld
 from mjx_refine.diagnosis.where import describe, misfit_map, places

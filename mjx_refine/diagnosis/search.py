@@ -7,24 +7,20 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
-from scipy import ndimage
 
 from mjx_refine.diagnosis.base import base_space, stored_base
+from mjx_refine.diagnosis.candidates import Candidate, Compared, lead_of
 from mjx_refine.diagnosis.exchange import Fitted, Key, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.fitted import Explained
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
-from mjx_refine.diagnosis.slack import spins, touching
+from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.diagnosis.walls import walls_from_pushes
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene
-from mjx_refine.view.picture import draw
-from mjx_refine.view.tiles import foreground
 
 FAMILIES = 7
 """Families (effect and target) that are fitted in full, the most promising first."""
@@ -39,9 +35,6 @@ CLOSE, SOME_OF_IT, MAY_ERR = 80.0, 0.6, 1.5
 """Those go on that then cost at most so much more than the best, or that part of what the best gains on the base model more; what
 strikes may cost this multiple, since its impact may not err yet. In eleven clips of the withheld exams with seeds 6 and 8 the
 best two families, and all that ended within 60 of the best, were below that."""
-
-DOUBT = {"friction_patch": 30.0}
-"""Lead that is taken off: no two engines slow bodies down alike, and a patch can imitate much of that."""
 
 ROAMING, HOPELESS = 2, -30.0
 """How many effects' fits look beyond where least squares ended, and the lead below which none does."""
@@ -64,38 +57,6 @@ SECOND_PROMISE = 8.0
 """Ditto for a second effect beside the first."""
 
 Told = Callable[[str], None]
-
-
-@dataclasses.dataclass(frozen=True)
-class Candidate(Explained):
-    """One effect (or several) fitted together with the base parameters.
-
-    Attributes:
-      fit: where it ended.
-      lead: of its evidence over the base model's, in natural logarithms.
-      promise: what the linear look said.
-    """
-
-    fit: Fit
-    lead: float
-    promise: float
-
-
-@dataclasses.dataclass(frozen=True)
-class Compared:
-    """All hypotheses of one clip.
-
-    Attributes:
-      base: the base model's fit.
-      candidates: single effects, the best evidence first.
-      pairs: two effects, the best evidence first.
-      impacts: how many impacts were allowed slack.
-    """
-
-    base: Fit
-    candidates: tuple[Candidate, ...]
-    pairs: tuple[Candidate, ...]
-    impacts: int
 
 
 def compare(
@@ -177,12 +138,12 @@ def _singles(
         base = other
     base, fitted = exchanged(clip, base, fitted)
     first = sorted(fitted, key=lambda key: -fitted[key][0].evidence)[:ROAMING]
-    first = [key for key in first if _lead(fitted[key][0], base) > HOPELESS]
+    first = [key for key in first if lead_of(fitted[key][0], base) > HOPELESS]
     for key, fit in zip(first, clip.crew.each(clip, _roamed, [(fitted[key][0], seed) for key in first]), strict=True):
         fitted[key] = (fit, fitted[key][1])
     base, fitted = exchanged(clip, base, fitted)
     fitted = at_least_nothing(clip, base, fitted)
-    finals = [Candidate(fit, _lead(fit, base), promise) for fit, promise in fitted.values()]
+    finals = [Candidate(fit, lead_of(fit, base), promise) for fit, promise in fitted.values()]
     return base, tuple(sorted(finals, key=lambda c: -c.lead))
 
 
@@ -194,11 +155,6 @@ def _keep(fitted: Fitted, key: Key, fit: Fit, promise: float) -> None:
 
 def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
     return clip.roam(clip.fit(fit.hypothesis, fit.z, 8), seed, ROAMED_AGAIN)
-
-
-def _lead(fit: Fit, base: Fit) -> float:
-    """Of a fit's evidence over the base model's."""
-    return fit.evidence - base.evidence - sum(DOUBT.get(t.name, 0.0) for t in fit.hypothesis.terms)
 
 
 def chosen_of(leads: list[Lead], families: int, starts: int = 2) -> list[Lead]:
@@ -292,7 +248,7 @@ def _pairs(
         beside += [(first, view, x) for x in chosen_of(leads, 3, 1) if x.gain > SECOND_PROMISE]
     lines = [f"{first.names[0]} and {lead.name}" for first, _, lead in beside]
     fits = clip.crew.each(clip, _second, [(first.fit, lead) for first, _, lead in beside], told, lines)
-    found = [Candidate(fit, _lead(fit, base), lead.gain) for fit, (_, _, lead) in zip(fits, beside, strict=True)]
+    found = [Candidate(fit, lead_of(fit, base), lead.gain) for fit, (_, _, lead) in zip(fits, beside, strict=True)]
     pushed = [
         (one, view, first.fit.cost)
         for one, (first, view, lead) in zip(found, beside, strict=True)
@@ -302,11 +258,11 @@ def _pairs(
     walls = walls_from_pushes(clip, [(one.fit, view, rival) for one, view, rival in pushed], told, lines)
     for wall, (one, *_) in zip(walls, pushed, strict=True):
         if wall is not None:
-            found.append(Candidate(wall, _lead(wall, base), one.promise))
+            found.append(Candidate(wall, lead_of(wall, base), one.promise))
     found.sort(key=lambda c: -c.lead)
     if found and found[0].lead > singles[0].lead:
         fit = clip.roam(found[0].fit, seed, ROAMED_AGAIN)
-        found[0] = dataclasses.replace(found[0], fit=fit, lead=_lead(fit, base))
+        found[0] = dataclasses.replace(found[0], fit=fit, lead=lead_of(fit, base))
     return tuple(found)
 
 
@@ -333,7 +289,9 @@ def _again(
     impacts = clip.allow_slack(base)
     rows = [(base, 10), *((one.fit, 8) for one in singles[:KEPT])]
     base, *fits = clip.crew.each(clip, _refitted, rows)
-    found = [dataclasses.replace(one, fit=fit, lead=_lead(fit, base)) for one, fit in zip(singles, fits, strict=False)]
+    found = [
+        dataclasses.replace(one, fit=fit, lead=lead_of(fit, base)) for one, fit in zip(singles, fits, strict=False)
+    ]
     return base, tuple(sorted(found, key=lambda c: -c.lead)), impacts
 
 
@@ -345,48 +303,3 @@ def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:
 def target_name(names: tuple[str, ...], target: int) -> str:
     """The object's name, or nothing where an effect has no single object."""
     return names[target] if target >= 0 else ""
-
-
-# --- what kinds see ---------------------------------------------------------------------------------------------------
-
-
-def view_of(
-    clip: ClipFit, fit: Fit, observation: Observation, masks_of: tuple[int, ...], hidden: bool = True
-) -> FitView:
-    """The fitted rollout, for those who look for a start; ``hidden``: with what should be seen and is not, which is drawn."""
-    batch = fit.hypothesis.batch(fit.z[None])
-    poses = np.nan_to_num(clip.poses(fit.hypothesis, fit.z[None])[0])
-    fps = clip.simulator.fps
-    velocity = np.gradient(poses[..., :3], axis=0) * fps if len(poses) > 1 else np.zeros_like(poses[..., :3])
-    spin = spins(poses, fps)
-    spin = np.concatenate([spin, spin[-1:]]) if len(spin) else np.zeros_like(velocity)
-    on_floor = touching(batch, poses)
-    plain = dataclasses.replace(batch, effects=())
-    places = hidden_places(poses, plain, observation, masks_of) if hidden else ()
-    return FitView(plain, poses, velocity, spin, on_floor, clip.measured.background, places, clip.image, fps)
-
-
-def hidden_places(
-    poses: Float[np.ndarray, "frames objects 7"], batch, observation: Observation, masks_of: tuple[int, ...]
-) -> tuple[tuple[float, float, float, float], ...]:
-    """Rectangles where objects should be seen by the base model and never are, the largest first."""
-    if observation.masks is None:
-        return ()
-    drawn, _ = draw(poses, batch, observation.size)
-    seen = foreground(observation) > 0
-    known = np.isin(drawn, [n + 1 for n, i in enumerate(masks_of) if i >= 0])
-    # An outline that is a pixel or two off is no occluder: what is missing must lie well inside of where an object is.
-    missing = np.array([ndimage.binary_erosion(d, iterations=2) & ~s for d, s in zip(known, seen, strict=True)])
-    place = missing.any(0) & ~seen.any(0)
-    place = ndimage.binary_opening(place, iterations=1)
-    labels = np.zeros(place.shape, np.int32)
-    count = int(np.asarray(ndimage.label(ndimage.binary_dilation(place, iterations=2), output=labels)))
-    boxes = []
-    for k in range(count):
-        rows, columns = np.nonzero((labels == k + 1) & place)
-        if len(rows) < 30:
-            continue
-        left, right = np.quantile(columns, [0.02, 0.98])
-        top, bottom = np.quantile(rows, [0.02, 0.98])
-        boxes.append((len(rows), (float(left) - 2, float(top) - 2, float(right) + 3, float(bottom) + 3)))
-    return tuple(box for _, box in sorted(boxes, reverse=True)[:3])

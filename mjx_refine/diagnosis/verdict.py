@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from mjx_refine.diagnosis.candidates import Candidate, Compared
 from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.search import Candidate, Compared
 from mjx_refine.diagnosis.where import misfit_map
 
 

@@ -14,6 +14,7 @@ from own_poses import BALL, CAMERA, GIVEN, SIGMA, THROW, acting, exact, recorded
 from mjx_refine import rotations
 from mjx_refine.cli.main import run
 from mjx_refine.diagnosis import diagnose_poses, load_poses, make_poses
+from mjx_refine.diagnosis.candidates import Candidate, Compared
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.poses.data import noise_of, rotation_vector
 from mjx_refine.diagnosis.poses.diagnose import unsettled
@@ -21,7 +22,6 @@ from mjx_refine.diagnosis.poses.fit import PosesFit, at_times, rate_of
 from mjx_refine.diagnosis.poses.heldout import kept_samples
 from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.diagnosis.poses.where import quiet
-from mjx_refine.diagnosis.search import Candidate, Compared
 from mjx_refine.diagnosis.verdict import Signs
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Body, Effect, Scene, load_scene, save_scene

@@ -13,7 +13,8 @@ from mjx_refine.diagnosis.diagnose import prepared
 from mjx_refine.diagnosis.fit import ClipFit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.screen import AWAY, Screen
-from mjx_refine.diagnosis.search import _begin, _fit_leads, view_of
+from mjx_refine.diagnosis.search import _begin, _fit_leads
+from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.effects import catalogue
 from mjx_refine.scene import Effect
 

@@ -31,7 +31,7 @@ from mjx_refine.diagnosis.poses.heldout import Errors, errors_of
 from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.diagnosis.poses.where import describe, misfit_map, seen_frames
 from mjx_refine.diagnosis.result import ClipGap, Diagnosis, Gap, PoseErrors
-from mjx_refine.diagnosis.search import view_of
+from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.diagnosis.store import Store
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView

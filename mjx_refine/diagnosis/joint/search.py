@@ -7,13 +7,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from mjx_refine.diagnosis.candidates import lead_of
 from mjx_refine.diagnosis.fit import SCALE, Fit
 from mjx_refine.diagnosis.fitted import Explained
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.screen import JointScreen
 from mjx_refine.diagnosis.joint.slack import set_slackness, with_slackness
 from mjx_refine.diagnosis.screen import Lead
-from mjx_refine.diagnosis.search import DOUBT, FORGIVING, SECOND_PROMISE, Told, chosen_of, target_name
+from mjx_refine.diagnosis.search import FORGIVING, SECOND_PROMISE, Told, chosen_of, target_name
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 
@@ -143,18 +144,13 @@ def _singles(
         base = other
     _not_below(clips, base, fitted)
     _from_the_best(clips, base, fitted)
-    found = [JointCandidate(fit, _lead(fit, base)) for fit in fitted.values()]
+    found = [JointCandidate(fit, lead_of(fit, base)) for fit in fitted.values()]
     return base, tuple(sorted(found, key=lambda c: -c.lead))
 
 
 def _look(clips: Clips, fit: JointFit, seen: Seen, names, scale: float = SCALE) -> list[Lead]:
     views = [seen.views(c, part) for c, part in enumerate(fit.parts)]
     return JointScreen(clips, fit, views, scale).leads(names)
-
-
-def _lead(fit: JointFit, base: JointFit) -> float:
-    """Of a fit's evidence over the base model's."""
-    return fit.evidence - base.evidence - sum(DOUBT.get(t.name, 0.0) for t in fit.hypothesis.terms)
 
 
 def _fit_lead(clips: Clips, here: JointFit, lead: Lead, rival: float, fitted: dict) -> None:
@@ -224,7 +220,7 @@ def _pairs(clips: Clips, base: JointFit, singles, seen: Seen, names, told: Told)
             one = lead.term(clips.frames)
             hypothesis = here.hypothesis.added(one)
             fit = clips.fit(hypothesis, _begin(clips, hypothesis, here, lead, lead.z(one)), 7)
-            found.append(JointCandidate(fit, _lead(fit, base)))
+            found.append(JointCandidate(fit, lead_of(fit, base)))
     return tuple(sorted(found, key=lambda c: -c.lead))
 
 

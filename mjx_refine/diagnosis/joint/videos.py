@@ -25,7 +25,7 @@ from mjx_refine.diagnosis.joint.together import (
     run,
 )
 from mjx_refine.diagnosis.result import Diagnosis
-from mjx_refine.diagnosis.search import view_of
+from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.diagnosis.store import Store
 from mjx_refine.diagnosis.verdict import map_of
 from mjx_refine.diagnosis.where import describe, misfit_map

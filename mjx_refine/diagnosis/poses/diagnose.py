@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from mjx_refine.diagnosis.candidates import Candidate, Compared
 from mjx_refine.diagnosis.diagnose import ranked, verdict_of
 from mjx_refine.diagnosis.fit import Fit
 from mjx_refine.diagnosis.heldout import HeldOut
@@ -18,7 +19,8 @@ from mjx_refine.diagnosis.poses.heldout import Errors, errors_of, held_out, tota
 from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.diagnosis.poses.where import describe, misfit_map, seen_frames
 from mjx_refine.diagnosis.result import Diagnosis, Gap, PoseErrors
-from mjx_refine.diagnosis.search import Candidate, Compared, compare, view_of
+from mjx_refine.diagnosis.search import compare
+from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.diagnosis.store import Store
 from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, signs, upheld
 from mjx_refine.diagnosis.where import places_of
