@@ -9,14 +9,14 @@ from collections.abc import Callable
 import numpy as np
 
 from mjx_refine.diagnosis.base import base_space, stored_base
-from mjx_refine.diagnosis.candidates import Candidate, Compared, lead_of
+from mjx_refine.diagnosis.candidates import Candidate, Compared, lead_of, struck_first
 from mjx_refine.diagnosis.exchange import Fitted, Key, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.walls import walls_from_pushes
+from mjx_refine.diagnosis.walls import push_last, walls_from_pushes
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 from mjx_refine.observation import Observation
@@ -144,7 +144,7 @@ def _singles(
     base, fitted = exchanged(clip, base, fitted)
     fitted = at_least_nothing(clip, base, fitted)
     finals = [Candidate(fit, lead_of(fit, base), promise) for fit, promise in fitted.values()]
-    return base, tuple(sorted(finals, key=lambda c: -c.lead))
+    return base, struck_first(clip, finals)
 
 
 def _keep(fitted: Fitted, key: Key, fit: Fit, promise: float) -> None:
@@ -251,11 +251,12 @@ def _pairs(
     found = [Candidate(fit, lead_of(fit, base), lead.gain) for fit, (_, _, lead) in zip(fits, beside, strict=True)]
     pushed = [
         (one, view, first.fit.cost)
-        for one, (first, view, lead) in zip(found, beside, strict=True)
-        if lead.name == "push" and "hidden_obstacle" in names and one.lead > first.lead
+        for one, (first, view, _) in zip(found, beside, strict=True)
+        if "push" in one.names and "hidden_obstacle" in names and one.lead > first.lead
     ]
-    lines = [f"{one.names[0]} and hidden_obstacle" for one, _, _ in pushed]
-    walls = walls_from_pushes(clip, [(one.fit, view, rival) for one, view, rival in pushed], told, lines)
+    lines = [f"{_other(one, 'push')} and hidden_obstacle" for one, _, _ in pushed]
+    rows = [(push_last(one.fit), view, rival) for one, view, rival in pushed]
+    walls = walls_from_pushes(clip, rows, told, lines)
     for wall, (one, *_) in zip(walls, pushed, strict=True):
         if wall is not None:
             found.append(Candidate(wall, lead_of(wall, base), one.promise))
@@ -263,7 +264,12 @@ def _pairs(
     if found and found[0].lead > singles[0].lead:
         fit = clip.roam(found[0].fit, seed, ROAMED_AGAIN)
         found[0] = dataclasses.replace(found[0], fit=fit, lead=lead_of(fit, base))
-    return tuple(found)
+    return struck_first(clip, found)
+
+
+def _other(one: Candidate, name: str) -> str:
+    """The effect of two beside one of this name."""
+    return one.names[0] if one.names[1] == name else one.names[1]
 
 
 def _second(clip: ClipFit, first: Fit, lead: Lead) -> Fit:
@@ -292,7 +298,7 @@ def _again(
     found = [
         dataclasses.replace(one, fit=fit, lead=lead_of(fit, base)) for one, fit in zip(singles, fits, strict=False)
     ]
-    return base, tuple(sorted(found, key=lambda c: -c.lead)), impacts
+    return base, struck_first(clip, found), impacts
 
 
 def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mjx_refine.diagnosis.candidates import Candidate, Compared
+from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.where import misfit_map
 
@@ -50,7 +50,7 @@ def signs(clip: ClipFit, compared: Compared, held_out: float, closed: float = 1.
     singles, pairs = compared.candidates, compared.pairs
     best = best_candidate(compared)
     left = min([clip.misfit(compared.base)] + [clip.misfit(c.fit) for c in (*singles[:3], *pairs[:1])])
-    unit = max(left, 0.3)
+    unit = max(left, LEAST_UNIT)
     first = singles[0] if singles else None
     other = next((c for c in singles if first is not None and c.names != first.names), None)
     after = best.fit if best is not None else compared.base

@@ -42,6 +42,20 @@ def walls_from_pushes(
     return [max((next(fits) for _ in rows), key=lambda wall: wall.evidence, default=None) for rows in begun]
 
 
+def push_last(fit: Fit) -> Fit:
+    """The fit with a push as its last effect; its derivatives are not to be used."""
+    hypothesis = fit.hypothesis
+    order = sorted(range(len(hypothesis.terms)), key=lambda k: hypothesis.terms[k].name == "push")
+    counts = [hypothesis.space.dimension, *(int(t.free.sum()) for t in hypothesis.terms)]
+    base, *own = np.split(fit.z, np.cumsum(counts)[:-1])
+    terms = tuple(hypothesis.terms[k] for k in order)
+    return dataclasses.replace(
+        fit,
+        hypothesis=dataclasses.replace(hypothesis, terms=terms),
+        z=np.concatenate([base, *(own[k] for k in order)]),
+    )
+
+
 def _facings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis, np.ndarray]]:
     """Where fits with an obstacle begin: it faces about along the push's impulse, about when that was."""
     *others, push = fit.hypothesis.terms

@@ -1,0 +1,85 @@
+"""Which of the fitted effects stands first: leads, and what is taken off them."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from test_diagnosis import FLIGHT
+
+from mjx_refine.diagnosis.base import base_space
+from mjx_refine.diagnosis.candidates import AGAINST, DOUBT, LEAST_UNIT, Candidate, lead_of, struck_first
+from mjx_refine.diagnosis.fitted import Fit
+from mjx_refine.diagnosis.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.walls import push_last
+
+MISFIT = 0.8
+PRICE = AGAINST * MISFIT
+
+
+def candidate(lead: float, *terms: tuple[str, int]) -> Candidate:
+    told = tuple(SimpleNamespace(name=name, target=target) for name, target in terms)
+    fit: Any = SimpleNamespace(hypothesis=SimpleNamespace(terms=told), evidence=lead)
+    return Candidate(fit, lead, 0.0)
+
+
+def order(*found: Candidate, misfit: float = MISFIT) -> list[tuple[str, float]]:
+    clip: Any = SimpleNamespace(misfit=lambda fit: misfit)
+    return [("+".join(one.names), one.lead) for one in struck_first(clip, found)]
+
+
+def test_an_obstacle_that_explains_a_push_nearly_as_well_stands_before_it():
+    wall, push = candidate(50.0, ("hidden_obstacle", 0)), candidate(50.0 + 0.9 * PRICE, ("push", 0))
+    drag = candidate(49.0, ("drag", 0))
+    told = order(push, drag, wall)
+    assert [name for name, _ in told] == ["hidden_obstacle", "drag", "push"]
+    assert told[2][1] == pytest.approx(push.lead - PRICE)
+    # However little is left, noise widths have a floor.
+    assert order(push, wall, misfit=0.0)[0][0] == "push"
+    assert (
+        order(push, dataclasses.replace(wall, lead=push.lead - 0.9 * AGAINST * LEAST_UNIT), misfit=0.0)[1][0] == "push"
+    )
+
+
+@pytest.mark.parametrize(
+    ("push", "wall"),
+    [
+        (candidate(50.0 + 1.1 * PRICE, ("push", 0)), candidate(50.0, ("hidden_obstacle", 0))),
+        (candidate(51.0, ("push", 1)), candidate(50.0, ("hidden_obstacle", 0))),
+        (candidate(51.0, ("push", 0), ("drag", 0)), candidate(50.0, ("hidden_obstacle", 0))),
+        (candidate(51.0, ("push", 0), ("drag", 0)), candidate(50.0, ("hidden_obstacle", 0), ("drag", 1))),
+        (candidate(51.0, ("drag", 0)), candidate(50.0, ("hidden_obstacle", 0))),
+    ],
+)
+def test_any_other_lead_stands(push, wall):
+    assert order(wall, push) == [("+".join(push.names), push.lead), ("+".join(wall.names), wall.lead)]
+
+
+def test_beside_another_effect_an_obstacle_stands_before_a_push_too():
+    both = candidate(90.0, ("push", 1), ("camera_motion", -1))
+    wall = candidate(85.0, ("camera_motion", -1), ("hidden_obstacle", 1))
+    assert [name for name, _ in order(both, wall)] == ["camera_motion+hidden_obstacle", "push+camera_motion"]
+
+
+def test_a_patch_leads_by_less_than_its_evidence():
+    base: Any = SimpleNamespace(evidence=-5.0)
+    assert lead_of(candidate(40.0, ("friction_patch", -1)).fit, base) == 45.0 - DOUBT["friction_patch"]
+    assert lead_of(candidate(40.0, ("drag", 0)).fit, base) == 45.0
+
+
+def test_a_push_becomes_the_last_effect_and_takes_its_numbers_along():
+    space = base_space(FLIGHT)
+    terms = (term("push", 0, 30, np.array([0.3, 0.0, 0.0, 0.0])), term("drag", 0, 30))
+    hypothesis = Hypothesis(space, terms)
+    z = np.arange(hypothesis.dimension, dtype=float) / hypothesis.dimension
+    fit = Fit(hypothesis, z, 1.0, 1.0, np.zeros((1, len(z))), np.zeros(1), 0.0)
+    turned = push_last(fit)
+    assert [t.name for t in turned.hypothesis.terms] == ["drag", "push"]
+    for k, other in ((0, 1), (1, 0)):
+        np.testing.assert_array_equal(hypothesis.values(z[None], k), turned.hypothesis.values(turned.z[None], other))
+    np.testing.assert_array_equal(turned.z[: space.dimension], z[: space.dimension])
+    again = push_last(turned)
+    np.testing.assert_array_equal(again.z, turned.z)
