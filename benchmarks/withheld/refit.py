@@ -231,7 +231,7 @@ HOPS = (0.5, 0.15)  # starts beside the best end so far, so many widths off
 NOTHING = 0.5  # px: with less left, no further start is tried
 
 
-def best(refit: Refit, rng: np.random.Generator, enough: float = 0.0) -> tuple[Fit, list[float]]:
+def best(refit: Refit, rng: np.random.Generator, enough: float = 0.0, draws: int = DRAWS) -> tuple[Fit, list[float]]:
     """The lowest of several fits, and all their costs in order.
 
     The starts: the truth at once; the truth with raised noise; the truth with more and more frames; draws of the prior
@@ -239,6 +239,7 @@ def best(refit: Refit, rng: np.random.Generator, enough: float = 0.0) -> tuple[F
 
     Args:
       refit: what is fitted. rng: of the draws. enough: an end with less left of the outlines [px] ends the search, too.
+      draws: how many starts from the prior; with none, the search ends with the fits from the truth.
     """
     zero = np.zeros(len(refit.base.numbers))
     ends: list[Fit] = []
@@ -253,7 +254,8 @@ def best(refit: Refit, rng: np.random.Generator, enough: float = 0.0) -> tuple[F
         return along(least(ends).shifts + rng.normal(0, hop, len(zero)), (Leg(step=step),))
 
     done = along(zero, DIRECT) or from_best(0, FINE) or along(zero, ANNEALED) or along(zero, GROWING)
-    for _ in range(DRAWS):
+    done = done or not draws
+    for _ in range(draws):
         done = done or along(rng.normal(size=len(zero)), ANNEALED)
     done = done or from_best(0, FINE)
     for hop in HOPS:
