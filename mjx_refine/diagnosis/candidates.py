@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.fitted import Explained
+from mjx_refine.effects.hidden_obstacle import touched
 
 DOUBT = {"friction_patch": 30.0}
 """Lead that is taken off: no two engines slow bodies down alike, and a patch can imitate much of that."""
@@ -17,6 +18,10 @@ AGAINST = 14.0
 that: an obstacle always pushes against the motion, a push does one time in three, and a push bends to what no two contacts agree
 in. Three to one is so much at the sharpness of ``verdict.SHARPNESS``. Of 29 clips of the withheld exams with seeds 3 to 10 in
 which one of the two was at work and one of them was named, 7 obstacles were called pushes, and no push an obstacle."""
+
+LEANT = 0.5
+"""Part of the time at an obstacle above which it is nothing that an object hits: a wall that a body rubs along from beginning
+to end slows it down as the air does, or a floor."""
 
 LEAST_UNIT = 0.3
 """Mean square residual that is assumed at least where leads are told in its units."""
@@ -69,8 +74,9 @@ def lead_of(fit: Weighed, base: Weighed) -> float:
     return fit.evidence - base.evidence - sum(DOUBT.get(t.name, 0.0) for t in fit.hypothesis.terms)
 
 
-def struck_first(clip: ClipFit, found: Sequence[Candidate]) -> tuple[Candidate, ...]:
-    """The candidates by their leads, pushes that an obstacle explains nearly as well behind it."""
+def in_order(clip: ClipFit, found: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """The candidates by their leads: no obstacles that are leant on, and pushes behind those that explain them nearly as well."""
+    found = [one for one in found if not _leans(clip, one.fit)]
 
     def told(one: Candidate) -> Candidate:
         price = AGAINST * max(clip.misfit(one.fit), LEAST_UNIT)
@@ -79,6 +85,17 @@ def struck_first(clip: ClipFit, found: Sequence[Candidate]) -> tuple[Candidate, 
         return one
 
     return tuple(sorted((told(one) for one in found), key=lambda one: -one.lead))
+
+
+def _leans(clip: ClipFit, fit: Fit) -> bool:
+    """Whether an object is at an obstacle most of the time."""
+    walls = [k for k, t in enumerate(fit.hypothesis.terms) if t.name == "hidden_obstacle"]
+    if not walls:
+        return False
+    z = fit.z[None]
+    poses, batch = clip.poses(fit.hypothesis, z)[0], fit.hypothesis.batch(z)
+    at = [touched(batch, poses, fit.hypothesis.terms[k].target, fit.hypothesis.values(z, k)[0]) for k in walls]
+    return max(float(here.mean()) for here in at) > LEANT
 
 
 def _obstacle_for(one: Candidate, other: Candidate) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mjx_refine.diagnosis.base import base_space, stored_base
-from mjx_refine.diagnosis.candidates import Candidate, Compared, lead_of, struck_first
+from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_of
 from mjx_refine.diagnosis.exchange import Fitted, Key, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
@@ -144,7 +144,7 @@ def _singles(
     base, fitted = exchanged(clip, base, fitted)
     fitted = at_least_nothing(clip, base, fitted)
     finals = [Candidate(fit, lead_of(fit, base), promise) for fit, promise in fitted.values()]
-    return base, struck_first(clip, finals)
+    return base, in_order(clip, finals)
 
 
 def _keep(fitted: Fitted, key: Key, fit: Fit, promise: float) -> None:
@@ -264,7 +264,7 @@ def _pairs(
     if found and found[0].lead > singles[0].lead:
         fit = clip.roam(found[0].fit, seed, ROAMED_AGAIN)
         found[0] = dataclasses.replace(found[0], fit=fit, lead=lead_of(fit, base))
-    return struck_first(clip, found)
+    return in_order(clip, found)
 
 
 def _other(one: Candidate, name: str) -> str:
@@ -298,7 +298,7 @@ def _again(
     found = [
         dataclasses.replace(one, fit=fit, lead=lead_of(fit, base)) for one, fit in zip(singles, fits, strict=False)
     ]
-    return base, struck_first(clip, found), impacts
+    return base, in_order(clip, found), impacts
 
 
 def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:

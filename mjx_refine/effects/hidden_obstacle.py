@@ -6,7 +6,7 @@ import dataclasses
 import functools
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
@@ -26,6 +26,9 @@ from mjx_refine.effects.kind import (
 
 STIFFNESS = 20000.0
 """Of the wall's contact at most [1/s^2]."""
+
+NEAR = 0.003
+"""Distance from the wall at which a body counts as being at it [m]."""
 
 
 class HiddenObstacle(EffectKind):
@@ -103,6 +106,16 @@ class HiddenObstacle(EffectKind):
         reach = float((foremost(still, 0, -normal) * normal).sum())
         distance = float(normal[0, :2] @ pose[0, 0, :2]) + reach
         return Start(np.array([angle, distance, 0.5]), width=np.array([25.0, 0.08, 0.3]))
+
+
+def touched(
+    batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], target: int, values: Float[np.ndarray, "3"]
+) -> Bool[np.ndarray, "frames"]:
+    """In which frames of the first candidate's motion the target is at the wall, to ``NEAR``."""
+    place, turn = poses[:, target, None, :3], poses[:, target, None, 3:]
+    motion = Motion(0.0, 1.0, place, turn, 0 * place, 0 * place, _alone(batch, target))
+    depth = _met_at(motion, 0, np.repeat(values[None], len(poses), 0))[2]
+    return depth > -NEAR
 
 
 def _met(motion: Motion, target: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -10,14 +10,22 @@ import numpy as np
 import pytest
 from test_diagnosis import FLIGHT
 
+from mjx_refine.diagnosis import candidates
 from mjx_refine.diagnosis.base import base_space
-from mjx_refine.diagnosis.candidates import AGAINST, DOUBT, LEAST_UNIT, Candidate, lead_of, struck_first
+from mjx_refine.diagnosis.candidates import AGAINST, DOUBT, LEAST_UNIT, Candidate, in_order, lead_of
 from mjx_refine.diagnosis.fitted import Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.walls import push_last
 
 MISFIT = 0.8
 PRICE = AGAINST * MISFIT
+
+
+@pytest.fixture(autouse=True)
+def _short_hits(request, monkeypatch):
+    """Obstacles are hit and left, but where a test is about that."""
+    if "leant" not in request.node.name:
+        monkeypatch.setattr(candidates, "_leans", lambda clip, fit: False)
 
 
 def candidate(lead: float, *terms: tuple[str, int]) -> Candidate:
@@ -28,7 +36,7 @@ def candidate(lead: float, *terms: tuple[str, int]) -> Candidate:
 
 def order(*found: Candidate, misfit: float = MISFIT) -> list[tuple[str, float]]:
     clip: Any = SimpleNamespace(misfit=lambda fit: misfit)
-    return [("+".join(one.names), one.lead) for one in struck_first(clip, found)]
+    return [("+".join(one.names), one.lead) for one in in_order(clip, found)]
 
 
 def test_an_obstacle_that_explains_a_push_nearly_as_well_stands_before_it():
@@ -62,6 +70,23 @@ def test_beside_another_effect_an_obstacle_stands_before_a_push_too():
     both = candidate(90.0, ("push", 1), ("camera_motion", -1))
     wall = candidate(85.0, ("camera_motion", -1), ("hidden_obstacle", 1))
     assert [name for name, _ in order(both, wall)] == ["camera_motion+hidden_obstacle", "push+camera_motion"]
+
+
+@pytest.mark.parametrize(("share", "kept"), [(0.3, True), (0.7, False)])
+def test_an_obstacle_that_is_leant_on_is_none(share, kept):
+    """A ball that rolls along the x axis past a wall at its side, and touches it for a share of the time."""
+    frames, radius = 30, FLIGHT.objects[0].size[0]
+    hypothesis = Hypothesis(base_space(FLIGHT), (term("hidden_obstacle", 0, frames, np.array([90.0, 0.0, 0.5])),))
+    z = np.zeros(hypothesis.dimension)
+    poses = np.zeros((frames, 1, 7))
+    poses[..., 3] = 1.0
+    poses[:, 0, 0] = np.linspace(0.0, 2.0, frames)
+    # The wall is y = 0, its outside y > 0.
+    poses[:, 0, 1] = np.where(np.arange(frames) < share * frames, radius + 0.002, radius + 0.05)
+    fit = Fit(hypothesis, z, 1.0, 1.0, np.zeros((1, len(z))), np.zeros(1), 0.0)
+    clip: Any = SimpleNamespace(misfit=lambda fit: MISFIT, poses=lambda hypothesis, z: poses[None])
+    one = Candidate(fit, 50.0, 0.0)
+    assert in_order(clip, [one]) == ((one,) if kept else ())
 
 
 def test_a_patch_leads_by_less_than_its_evidence():
