@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -13,10 +12,12 @@ from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_
 from mjx_refine.diagnosis.exchange import Fitted, Key, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
+from mjx_refine.diagnosis.leads import beginning, chosen_of
+from mjx_refine.diagnosis.pairs import pairs_of
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.walls import push_last, walls_from_pushes
+from mjx_refine.diagnosis.walls import walls_from_pushes
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 from mjx_refine.observation import Observation
@@ -49,12 +50,6 @@ takes off less than half, and a camera that shakes had made twenty times too muc
 
 FORGIVING = 40.0
 """Scale of the robust loss while a fit is far off [noise widths]."""
-
-PROMISE = 2.0
-"""Evidence that the linear look must promise for a family to be fitted."""
-
-SECOND_PROMISE = 8.0
-"""Ditto for a second effect beside the first."""
 
 Told = Callable[[str], None]
 
@@ -98,7 +93,7 @@ def compare(
     if singles and singles[0].lead > CLEAR and clip.misfit(singles[0].fit) < TOO_QUIET:
         told("noise, once more")
         base, singles, impacts = _again(clip, base, singles, seed)
-    pairs = _pairs(clip, base, singles, names, observation, masks_of, seed, told)
+    pairs = pairs_of(clip, base, singles, names, observation, masks_of, seed, told)
     return Compared(base, singles, pairs, impacts)
 
 
@@ -157,17 +152,6 @@ def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
     return clip.roam(clip.fit(fit.hypothesis, fit.z, 8), seed, ROAMED_AGAIN)
 
 
-def chosen_of(leads: list[Lead], families: int, starts: int = 2) -> list[Lead]:
-    """The best starts of the best families: several where place or moment matter, else one."""
-    kept: dict[tuple[str, int], list[Lead]] = {}
-    for lead in leads:
-        family = kept.setdefault((lead.name, lead.target), [])
-        if len(family) < (starts if lead.start.places > 1 else 1):
-            family.append(lead)
-    best = [family for family in kept.values() if family[0].gain > PROMISE][:families]
-    return [lead for family in best for lead in family]
-
-
 def _fit_leads(
     clip: ClipFit, rows: list[tuple[Fit, Lead]], rival: float, least: float, told: Told, lines: list[str]
 ) -> list[Fit]:
@@ -198,7 +182,7 @@ def _begun(clip: ClipFit, here: Fit, lead: Lead, rival: float) -> Fit:
     """A lead's fit after its first steps."""
     one = lead.term(clip.frames)
     hypothesis = here.hypothesis.added(one)
-    z = _begin(clip, hypothesis, here, lead, lead.z(one))
+    z = beginning(clip, hypothesis, here, lead, lead.z(one))
     if not here.z.any():
         z = clip.fit(hypothesis, z, 7, scale=FORGIVING).z
     fit = clip.fit(hypothesis, z, 9, rival=rival, attempts=LOOK)
@@ -213,14 +197,6 @@ def _ended(clip: ClipFit, fit: Fit, rival: float) -> Fit:
     return knocked(clip, fit if fit.ended else clip.gone_on(fit, REST, rival), rival)
 
 
-def _begin(clip: ClipFit, hypothesis: Hypothesis, base: Fit, lead: Lead, z: np.ndarray) -> np.ndarray:
-    """Where the fit starts: a part of the way that the linear look points, base parameters and effect together."""
-    parts = (0.0, 0.1, 0.3, 0.6, 1.0) if lead.start.columns else (0.0, 0.3, 1.0)
-    limited = np.clip(lead.shift, -10.0, 10.0)
-    points = [np.concatenate([base.z + a * limited, z if lead.whole else a * z]) for a in parts]
-    return clip.best_of(hypothesis, np.array(points))
-
-
 def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: Fitted, walled: list[Fit], view: FitView, told: Told) -> None:
     """An obstacle begins where a push was found; ``walled`` are those pushes for which that was done before."""
     pushes = [(target, *found) for (name, target), found in fitted.items() if name == "push"]
@@ -231,53 +207,6 @@ def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: Fitted, walled: list[Fi
     for (target, _, promise), wall in zip(pushes, walls, strict=True):
         if wall is not None:
             _keep(fitted, ("hidden_obstacle", target), wall, promise)
-
-
-def _pairs(
-    clip: ClipFit, base: Fit, singles, names, observation, masks_of, seed: int, told: Told
-) -> tuple[Candidate, ...]:
-    """Forward selection of a second effect beside the best one or two."""
-    beside: list[tuple[Candidate, FitView, Lead]] = []
-    for first in itertools.takewhile(lambda one: one.lead >= 15.0, singles[:2]):
-        view = view_of(clip, first.fit, observation, masks_of)
-        leads = Screen(clip, first.fit, view).leads(
-            [n for n in names if n not in first.names or catalogue()[n].targeted]
-        )
-        leads = [x for x in leads if (x.name, x.target) not in set(zip(first.names, first.targets, strict=True))]
-        # Three effects, not three moments of one push.
-        beside += [(first, view, x) for x in chosen_of(leads, 3, 1) if x.gain > SECOND_PROMISE]
-    lines = [f"{first.names[0]} and {lead.name}" for first, _, lead in beside]
-    fits = clip.crew.each(clip, _second, [(first.fit, lead) for first, _, lead in beside], told, lines)
-    found = [Candidate(fit, lead_of(fit, base), lead.gain) for fit, (_, _, lead) in zip(fits, beside, strict=True)]
-    pushed = [
-        (one, view, first.fit.cost)
-        for one, (first, view, _) in zip(found, beside, strict=True)
-        if "push" in one.names and "hidden_obstacle" in names and one.lead > first.lead
-    ]
-    lines = [f"{_other(one, 'push')} and hidden_obstacle" for one, _, _ in pushed]
-    rows = [(push_last(one.fit), view, rival) for one, view, rival in pushed]
-    walls = walls_from_pushes(clip, rows, told, lines)
-    for wall, (one, *_) in zip(walls, pushed, strict=True):
-        if wall is not None:
-            found.append(Candidate(wall, lead_of(wall, base), one.promise))
-    found.sort(key=lambda c: -c.lead)
-    if found and found[0].lead > singles[0].lead:
-        fit = clip.roam(found[0].fit, seed, ROAMED_AGAIN)
-        found[0] = dataclasses.replace(found[0], fit=fit, lead=lead_of(fit, base))
-    return in_order(clip, found)
-
-
-def _other(one: Candidate, name: str) -> str:
-    """The effect of two beside one of this name."""
-    return one.names[0] if one.names[1] == name else one.names[1]
-
-
-def _second(clip: ClipFit, first: Fit, lead: Lead) -> Fit:
-    """The fit with one more effect."""
-    one = lead.term(clip.frames)
-    hypothesis = first.hypothesis.added(one)
-    fit = clip.fit(hypothesis, _begin(clip, hypothesis, first, lead, lead.z(one)), 7, rival=first.cost)
-    return knocked(clip, fit, first.cost)
 
 
 def _again(

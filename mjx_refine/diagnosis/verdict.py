@@ -124,12 +124,15 @@ STRANGE, CLEAR, STRANGEST = 1.3, 150.0, 3.2
 effect that lets twice as much be left; how much no margin lets be left (of 8 names with 1.9 and more on seeds 6 to 8 of the
 exam those with less than this were right, or one of two at work)."""
 
-FAR_OFF = 3.0
+FAR_OFF = 2.0
 """Mean square residual of the best hypothesis above which that is not what, or not all that, is missing."""
 
-PAIRED, PART_PAIRED = 50.0, 0.25
+PAIRED, PART_PAIRED, PART_BESIDE = 50.0, 0.15, 0.01
 """Lead of two effects over the best one, and its part of that one's lead, from which both are named: a first effect that is not
-quite right leaves the more the larger it is."""
+quite right leaves the more the larger it is. The last: the least part where less of a lead is asked for."""
+
+LOOSE = 2.0
+"""Structure of the residuals above which not both of two effects are named."""
 
 LEFT_OVER, CLEARED = 2.5, 0.4
 """Structure of the residuals that the best single effect leaves, and the part of it that two may leave, for both to be named with
@@ -207,7 +210,7 @@ def answer(told: Signs, leads: list[float], video: bool = False) -> Answer:
     if told.closed < CLOSES or (video and told.after > FAR_OFF):
         return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
     paired = _paired(told, video)
-    allowed = np.inf if paired else STRANGE * (1 + max(told.margin, 0.0) / CLEAR)
+    allowed = (LOOSE if video else np.inf) if paired else STRANGE * (1 + max(told.margin, 0.0) / CLEAR)
     if told.structure_after > (min(allowed, STRANGEST) if video else allowed):
         return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
     if paired:
@@ -236,7 +239,7 @@ def _paired(told: Signs, video: bool) -> bool:
     """Whether two effects explain enough more than the best one."""
     cleared = told.structure_first > LEFT_OVER and told.structure_after < CLEARED * told.structure_first
     less = video and (cleared or bool(told.beside))
-    return told.pair > PAIRED and (less or told.pair > PART_PAIRED * told.lead)
+    return told.pair > max(PAIRED, (PART_BESIDE if less else PART_PAIRED) * told.lead)
 
 
 def map_of(clip: ClipFit, fit) -> np.ndarray:

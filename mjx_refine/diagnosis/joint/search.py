@@ -13,8 +13,10 @@ from mjx_refine.diagnosis.fitted import Explained
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.screen import JointScreen
 from mjx_refine.diagnosis.joint.slack import set_slackness, with_slackness
+from mjx_refine.diagnosis.leads import chosen_of
+from mjx_refine.diagnosis.pairs import SECOND_PROMISE
 from mjx_refine.diagnosis.screen import Lead
-from mjx_refine.diagnosis.search import FORGIVING, SECOND_PROMISE, Told, chosen_of, target_name
+from mjx_refine.diagnosis.search import FORGIVING, Told, target_name
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 

@@ -1,0 +1,158 @@
+"""Two effects at once: a second beside the best, and the best together."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.diagnosis.candidates import Candidate, in_order, lead_of
+from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.knock import knocked
+from mjx_refine.diagnosis.leads import beginning, chosen_of
+from mjx_refine.diagnosis.roam import ROAMED_AGAIN
+from mjx_refine.diagnosis.screen import Lead, Screen
+from mjx_refine.diagnosis.shown import view_of
+from mjx_refine.diagnosis.walls import push_last, walls_from_pushes
+from mjx_refine.effects import catalogue
+from mjx_refine.observation import Observation
+
+SECOND_PROMISE = 8.0
+"""Ditto for a second effect beside the first."""
+
+LEADS, FIRSTS = 15.0, 2
+"""Lead that an effect needs for a second one to be looked for beside it, and beside how many causes that is done."""
+
+JOINED, TOGETHER = 5, 4
+"""Of how many of the best effects twos are put together, and how many twos, those whose leads add up to the most: what each
+found alone is a better place to begin than a linear look from a fit that has bent to the other effect."""
+
+ITERATIONS = 7
+"""Of least squares of two effects."""
+
+WALLS = 2
+"""How many of the best twos with a push are looked at with an obstacle in its place."""
+
+
+Told = Callable[[str], None]
+
+
+def pairs_of(
+    clip: ClipFit,
+    base: Fit,
+    singles: tuple[Candidate, ...],
+    names: list[str],
+    observation: Observation,
+    masks_of: tuple[int, ...],
+    seed: int,
+    told: Told,
+) -> tuple[Candidate, ...]:
+    """Two effects at once, the best evidence first; none where no effect by itself leads enough.
+
+    Args:
+      clip: residuals.
+      base: the base model's fit.
+      singles: every effect by itself, the best evidence first.
+      names: of the catalogue.
+      observation: the clip.
+      masks_of: mask id of each object, or -1.
+      seed: of random hops.
+      told: called with a line for each step.
+    """
+    beside = list(_beside(clip, singles, names, observation, masks_of))
+    lines = [f"{first.names[0]} and {lead.name}" for first, lead in beside]
+    fits = clip.crew.each(clip, _second, [(first.fit, lead) for first, lead in beside], told, lines)
+    found = [Candidate(fit, lead_of(fit, base), lead.gain) for fit, (_, lead) in zip(fits, beside, strict=True)]
+    together = list(_together(clip, base, singles)) if beside else []
+    lines = [f"{first.names[0]} and {second.names[0]}, together" for _, _, first, second in together]
+    rows = [(hypothesis, z, min(first.fit.cost, second.fit.cost)) for hypothesis, z, first, second in together]
+    fits = clip.crew.each(clip, _joined, rows, told, lines)
+    found += [Candidate(fit, lead_of(fit, base), 0.0) for fit in fits]
+    found.sort(key=lambda one: -one.lead)
+    if "hidden_obstacle" in names:
+        found += _walled(clip, base, singles, found, observation, masks_of, told)
+        found.sort(key=lambda one: -one.lead)
+    if found and found[0].lead > singles[0].lead:
+        fit = clip.roam(found[0].fit, seed, ROAMED_AGAIN)
+        found[0] = dataclasses.replace(found[0], fit=fit, lead=lead_of(fit, base))
+    return in_order(clip, found)
+
+
+def _beside(
+    clip: ClipFit, singles: tuple[Candidate, ...], names: list[str], observation: Observation, masks_of: tuple[int, ...]
+) -> Iterator[tuple[Candidate, Lead]]:
+    """Forward selection: what the linear look promises beside the best effects."""
+    firsts: list[Candidate] = []
+    for one in itertools.takewhile(lambda one: one.lead >= LEADS, singles):
+        if len(firsts) < FIRSTS and not any(_one_cause(one, other) for other in firsts):
+            firsts.append(one)
+    for first in firsts:
+        view = view_of(clip, first.fit, observation, masks_of)
+        leads = Screen(clip, first.fit, view).leads(
+            [n for n in names if n not in first.names or catalogue()[n].targeted]
+        )
+        leads = [x for x in leads if (x.name, x.target) not in set(zip(first.names, first.targets, strict=True))]
+        # Three effects, not three moments of one push.
+        yield from ((first, x) for x in chosen_of(leads, 3, 1) if x.gain > SECOND_PROMISE)
+
+
+def _one_cause(one: Candidate, other: Candidate) -> bool:
+    """Whether two effects are the same, or a push and an obstacle in its place."""
+    same = one.targets == other.targets
+    return same and (one.names == other.names or {*one.names, *other.names} == {"push", "hidden_obstacle"})
+
+
+def _together(
+    clip: ClipFit, base: Fit, singles: tuple[Candidate, ...]
+) -> Iterator[tuple[Hypothesis, Float[np.ndarray, "dimension"], Candidate, Candidate]]:
+    """The most promising twos of the best effects, each as it was found alone, and where their fits begin."""
+    count = base.hypothesis.dimension
+    twos = [two for two in itertools.combinations(singles[:JOINED], 2) if not _one_cause(*two) and two[1].lead > 0]
+    for one, other in sorted(twos, key=lambda two: -two[0].lead - two[1].lead)[:TOGETHER]:
+        hypothesis = one.fit.hypothesis.added(other.fit.hypothesis.terms[-1])
+        first, second = one.fit.z, other.fit.z
+        grounds = [first[:count], second[:count], first[:count] + second[:count] - base.z]
+        points = np.array([np.concatenate([z, first[count:], second[count:]]) for z in grounds])
+        yield hypothesis, clip.best_of(hypothesis, points), one, other
+
+
+def _walled(
+    clip: ClipFit,
+    base: Fit,
+    singles: tuple[Candidate, ...],
+    found: list[Candidate],
+    observation: Observation,
+    masks_of: tuple[int, ...],
+    told: Told,
+) -> list[Candidate]:
+    """The best twos with a push once more with an obstacle in its place."""
+    pushed = [one for one in found if "push" in one.names and one.lead > singles[0].lead][:WALLS]
+    lines = [f"{_other(one, 'push')} and hidden_obstacle" for one in pushed]
+    rows = [(push_last(one.fit), view_of(clip, one.fit, observation, masks_of), base.cost) for one in pushed]
+    walls = walls_from_pushes(clip, rows, told, lines)
+    return [
+        Candidate(wall, lead_of(wall, base), one.promise)
+        for wall, one in zip(walls, pushed, strict=True)
+        if wall is not None
+    ]
+
+
+def _other(one: Candidate, name: str) -> str:
+    """The effect of two beside one of this name."""
+    return one.names[0] if one.names[1] == name else one.names[1]
+
+
+def _second(clip: ClipFit, first: Fit, lead: Lead) -> Fit:
+    """The fit with one more effect."""
+    one = lead.term(clip.frames)
+    hypothesis = first.hypothesis.added(one)
+    return _joined(clip, hypothesis, beginning(clip, hypothesis, first, lead, lead.z(one)), first.cost)
+
+
+def _joined(clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimension"], rival: float) -> Fit:
+    """The fit of two effects; ``rival``: what one of them alone costs."""
+    return knocked(clip, clip.fit(hypothesis, z, ITERATIONS, rival=rival), rival)
