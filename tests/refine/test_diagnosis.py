@@ -132,11 +132,15 @@ SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
         ({"lead": 5.0, "whole": 9.0}, "unknown"),
         ({"structure_after": 40.0, "after": 5.0}, "unknown"),
         ({"pair": 200.0}, "pair"),
-        ({"pair": 60.0}, "single"),
-        ({"pair": 60.0, "structure_first": 9.0}, "pair"),
-        ({"pair": 60.0, "structure_first": 2.0}, "single"),
-        ({"pair": 40.0, "structure_first": 9.0}, "single"),
-        ({"pair": 60.0, "beside": 1.0}, "pair"),
+        ({"pair": 90.0}, "single"),
+        ({"lead": 3000.0, "pair": 200.0}, "single"),
+        ({"lead": 3000.0, "pair": 200.0, "structure_first": 9.0}, "pair"),
+        ({"lead": 3000.0, "pair": 200.0, "structure_first": 2.0}, "single"),
+        ({"pair": 90.0, "structure_first": 9.0}, "single"),
+        ({"lead": 3000.0, "pair": 200.0, "beside": 1.0}, "pair"),
+        ({"lead": 30000.0, "pair": 200.0, "beside": 1.0}, "single"),
+        ({"pair": 200.0, "structure_after": 2.2}, "unknown"),
+        ({"after": 2.2}, "unknown"),
         ({"pair": 200.0, "structure_after": 9.0, "structure_first": 90.0}, "unknown"),
         ({"after": 5.0}, "unknown"),
         ({"structure_after": 3.0, "margin": 900.0}, "single"),
@@ -159,7 +163,8 @@ def test_the_answer_follows_the_signs(changes, kind):
 def test_poses_may_err_smoothly_and_more_than_their_noise_says(changes):
     assert answer(dataclasses.replace(SIGNS, **changes), [300.0, 150.0]).kind == "single"
     assert answer(dataclasses.replace(SIGNS, **changes, pair=200.0), [300.0, 150.0]).kind == "pair"
-    assert answer(dataclasses.replace(SIGNS, pair=60.0, structure_first=9.0), [300.0, 150.0]).kind == "single"
+    far = dataclasses.replace(SIGNS, lead=3000.0, pair=200.0, structure_first=9.0)
+    assert answer(far, [300.0, 150.0]).kind == "single"
 
 
 @pytest.mark.parametrize(
@@ -170,7 +175,8 @@ def test_poses_may_err_smoothly_and_more_than_their_noise_says(changes):
         ({"pair": 30.0}, False),
         ({"pair": 30.0, "margin": 900.0}, True),
         ({"pair": 12.0, "margin": 10.0}, False),
-        ({"pair": 200.0}, False),
+        ({"pair": 90.0}, False),
+        ({"pair": 200.0}, True),
         ({"after": 5.0}, True),
         ({"lead": 20.0, "held_out": 0.0}, True),
         ({"lead": 20.0, "held_out": 9.0}, False),
