@@ -9,22 +9,21 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import Float
 
-from mjx_refine.diagnosis.candidates import Candidate, in_order, lead_of
+from mjx_refine.diagnosis.candidates import Candidate, in_order, lead_of, obstacle_for
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import beginning, chosen_of
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
-from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.diagnosis.walls import push_last, walls_from_pushes
 from mjx_refine.effects import catalogue
-from mjx_refine.observation import Observation
+from mjx_refine.effects.kind import FitView
 
 SECOND_PROMISE = 8.0
-"""Ditto for a second effect beside the first."""
+"""Evidence that the linear look must promise for a second effect to be fitted beside the first."""
 
-LEADS, FIRSTS = 15.0, 2
+PROMISE_OF_PAIRS, FIRSTS = 15.0, 2
 """Lead that an effect needs for a second one to be looked for beside it, and beside how many causes that is done."""
 
 JOINED, TOGETHER = 5, 4
@@ -37,8 +36,8 @@ ITERATIONS = 7
 WALLS = 2
 """How many of the best twos with a push are looked at with an obstacle in its place."""
 
-
 Told = Callable[[str], None]
+Shown = Callable[[Fit], FitView]
 
 
 def pairs_of(
@@ -46,8 +45,7 @@ def pairs_of(
     base: Fit,
     singles: tuple[Candidate, ...],
     names: list[str],
-    observation: Observation,
-    masks_of: tuple[int, ...],
+    shown: Shown,
     seed: int,
     told: Told,
 ) -> tuple[Candidate, ...]:
@@ -58,12 +56,11 @@ def pairs_of(
       base: the base model's fit.
       singles: every effect by itself, the best evidence first.
       names: of the catalogue.
-      observation: the clip.
-      masks_of: mask id of each object, or -1.
+      shown: what a fit shows to those who look for a start.
       seed: of random hops.
       told: called with a line for each step.
     """
-    beside = list(_beside(clip, singles, names, observation, masks_of))
+    beside = list(_beside(clip, singles, names, shown))
     lines = [f"{first.names[0]} and {lead.name}" for first, lead in beside]
     fits = clip.crew.each(clip, _second, [(first.fit, lead) for first, lead in beside], told, lines)
     found = [Candidate(fit, lead_of(fit, base), lead.gain) for fit, (_, lead) in zip(fits, beside, strict=True)]
@@ -74,7 +71,7 @@ def pairs_of(
     found += [Candidate(fit, lead_of(fit, base), 0.0) for fit in fits]
     found.sort(key=lambda one: -one.lead)
     if "hidden_obstacle" in names:
-        found += _walled(clip, base, singles, found, observation, masks_of, told)
+        found += _walled(clip, base, singles, found, shown, told)
         found.sort(key=lambda one: -one.lead)
     if found and found[0].lead > singles[0].lead:
         fit = clip.roam(found[0].fit, seed, ROAMED_AGAIN)
@@ -83,18 +80,16 @@ def pairs_of(
 
 
 def _beside(
-    clip: ClipFit, singles: tuple[Candidate, ...], names: list[str], observation: Observation, masks_of: tuple[int, ...]
+    clip: ClipFit, singles: tuple[Candidate, ...], names: list[str], shown: Shown
 ) -> Iterator[tuple[Candidate, Lead]]:
     """Forward selection: what the linear look promises beside the best effects."""
     firsts: list[Candidate] = []
-    for one in itertools.takewhile(lambda one: one.lead >= LEADS, singles):
+    for one in itertools.takewhile(lambda one: one.lead >= PROMISE_OF_PAIRS, singles):
         if len(firsts) < FIRSTS and not any(_one_cause(one, other) for other in firsts):
             firsts.append(one)
     for first in firsts:
-        view = view_of(clip, first.fit, observation, masks_of)
-        leads = Screen(clip, first.fit, view).leads(
-            [n for n in names if n not in first.names or catalogue()[n].targeted]
-        )
+        others = [n for n in names if n not in first.names or catalogue()[n].targeted]
+        leads = Screen(clip, first.fit, shown(first.fit)).leads(others)
         leads = [x for x in leads if (x.name, x.target) not in set(zip(first.names, first.targets, strict=True))]
         # Three effects, not three moments of one push.
         yield from ((first, x) for x in chosen_of(leads, 3, 1) if x.gain > SECOND_PROMISE)
@@ -102,8 +97,8 @@ def _beside(
 
 def _one_cause(one: Candidate, other: Candidate) -> bool:
     """Whether two effects are the same, or a push and an obstacle in its place."""
-    same = one.targets == other.targets
-    return same and (one.names == other.names or {*one.names, *other.names} == {"push", "hidden_obstacle"})
+    same = (one.names, one.targets) == (other.names, other.targets)
+    return same or obstacle_for(one, other) or obstacle_for(other, one)
 
 
 def _together(
@@ -125,14 +120,13 @@ def _walled(
     base: Fit,
     singles: tuple[Candidate, ...],
     found: list[Candidate],
-    observation: Observation,
-    masks_of: tuple[int, ...],
+    shown: Shown,
     told: Told,
 ) -> list[Candidate]:
     """The best twos with a push once more with an obstacle in its place."""
     pushed = [one for one in found if "push" in one.names and one.lead > singles[0].lead][:WALLS]
     lines = [f"{_other(one, 'push')} and hidden_obstacle" for one in pushed]
-    rows = [(push_last(one.fit), view_of(clip, one.fit, observation, masks_of), base.cost) for one in pushed]
+    rows = [(push_last(one.fit), shown(one.fit), base.cost) for one in pushed]
     walls = walls_from_pushes(clip, rows, told, lines)
     return [
         Candidate(wall, lead_of(wall, base), one.promise)

@@ -13,7 +13,7 @@ from mjx_refine.diagnosis.exchange import Fitted, Key, at_least_nothing, exchang
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import beginning, chosen_of
-from mjx_refine.diagnosis.pairs import pairs_of
+from mjx_refine.diagnosis.pairs import Told, pairs_of
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.diagnosis.shown import view_of
@@ -50,8 +50,6 @@ takes off less than half, and a camera that shakes had made twenty times too muc
 
 FORGIVING = 40.0
 """Scale of the robust loss while a fit is far off [noise widths]."""
-
-Told = Callable[[str], None]
 
 
 def compare(
@@ -93,7 +91,7 @@ def compare(
     if singles and singles[0].lead > CLEAR and clip.misfit(singles[0].fit) < TOO_QUIET:
         told("noise, once more")
         base, singles, impacts = _again(clip, base, singles, seed)
-    pairs = pairs_of(clip, base, singles, names, observation, masks_of, seed, told)
+    pairs = pairs_of(clip, base, singles, names, lambda fit: view_of(clip, fit, observation, masks_of), seed, told)
     return Compared(base, singles, pairs, impacts)
 
 

@@ -211,8 +211,7 @@ def answer(told: Signs, leads: list[float], video: bool = False) -> Answer:
     if told.closed < CLOSES or (video and told.after > FAR_OFF):
         return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
     paired = _paired(told, video)
-    allowed = (LOOSE if video else np.inf) if paired else STRANGE * (1 + max(told.margin, 0.0) / CLEAR)
-    if told.structure_after > (min(allowed, STRANGEST) if video else allowed):
+    if told.structure_after > _allowed(told, paired, video):
         return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
     if paired:
         return Answer("pair", LIKELY if video else UNLIKELY, shares, AT_WORK["likely" if video else "less"])
@@ -234,6 +233,14 @@ def upheld(said: Answer, compared: Compared, closed_of: Callable[[Fit], float]) 
     if closed_of(compared.candidates[0].fit) >= CLOSES:
         return said
     return Answer("unknown", LIKELY, said.shares, AT_WORK["unknown"])
+
+
+def _allowed(told: Signs, paired: bool, video: bool) -> float:
+    """Structure that residuals may have for what is named to be all that is missing."""
+    if paired:
+        return LOOSE if video else np.inf
+    allowed = STRANGE * (1 + max(told.margin, 0.0) / CLEAR)
+    return min(allowed, STRANGEST) if video else allowed
 
 
 def _paired(told: Signs, video: bool) -> bool:

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
@@ -26,9 +26,6 @@ from mjx_refine.effects.kind import (
 
 STIFFNESS = 20000.0
 """Of the wall's contact at most [1/s^2]."""
-
-NEAR = 0.003
-"""Distance from the wall at which a body counts as being at it [m]."""
 
 
 class HiddenObstacle(EffectKind):
@@ -88,8 +85,7 @@ class HiddenObstacle(EffectKind):
         return [dataclasses.replace(start, places=len(found)) for start in found]
 
     def window(self, view: FitView, target: int, values: np.ndarray) -> tuple[int, int] | None:
-        along = [self.facing(view, target, t, float(values[0])).values[1] for t in range(view.frames)]
-        near = np.nonzero(np.array(along) < values[1] + 0.02)[0]
+        near = np.nonzero(gaps(view.batch, view.poses, target, values) < 0.02)[0]
         if len(near) == 0:
             return None
         first = int(near[0])
@@ -108,14 +104,13 @@ class HiddenObstacle(EffectKind):
         return Start(np.array([angle, distance, 0.5]), width=np.array([25.0, 0.08, 0.3]))
 
 
-def touched(
+def gaps(
     batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], target: int, values: Float[np.ndarray, "3"]
-) -> Bool[np.ndarray, "frames"]:
-    """In which frames of the first candidate's motion the target is at the wall, to ``NEAR``."""
+) -> Float[np.ndarray, "frames"]:
+    """How far the target is from the wall in every frame of the first candidate's motion [m]; less than nothing in the wall."""
     place, turn = poses[:, target, None, :3], poses[:, target, None, 3:]
     motion = Motion(0.0, 1.0, place, turn, 0 * place, 0 * place, _alone(batch, target))
-    depth = _met_at(motion, 0, np.repeat(values[None], len(poses), 0))[2]
-    return depth > -NEAR
+    return -_met_at(motion, 0, np.repeat(values[None], len(poses), 0))[2]
 
 
 def _met(motion: Motion, target: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -14,9 +14,9 @@ from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.screen import JointScreen
 from mjx_refine.diagnosis.joint.slack import set_slackness, with_slackness
 from mjx_refine.diagnosis.leads import chosen_of
-from mjx_refine.diagnosis.pairs import SECOND_PROMISE
+from mjx_refine.diagnosis.pairs import PROMISE_OF_PAIRS, SECOND_PROMISE, Told
 from mjx_refine.diagnosis.screen import Lead
-from mjx_refine.diagnosis.search import FORGIVING, Told, target_name
+from mjx_refine.diagnosis.search import FORGIVING, target_name
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 
@@ -31,9 +31,6 @@ RIVALS = 3
 
 GOOD = 2.5
 """Mean square residual above which a clip looks for another start by itself."""
-
-PROMISE_OF_PAIRS = 15.0
-"""Lead that an effect needs for a second one to be looked for beside it."""
 
 
 @dataclasses.dataclass(frozen=True)
