@@ -281,13 +281,20 @@ def _widened(masks: np.ndarray, poses: np.ndarray, one: SceneBatch, size, fps: f
             inside = fine == n + 1
             if not inside.any():
                 continue
-            edges = np.pad(inside, 1, mode="edge")
+            near = tuple(_around(inside.any(1 - axis), margin) for axis in range(2))
+            edges = np.pad(inside[tuple(slice(p.start * FINE, p.stop * FINE) for p in near)], 1, mode="edge")
             signed = _signed_distance(edges)[1:-1, 1:-1] / FINE
-            depth[n] = signed[middle::FINE, middle::FINE]
+            depth[n][near] = signed[middle::FINE, middle::FINE]
         best = depth.argmin(0)
         grown = np.where(depth.min(0) <= width, best + 1, 0)
         result[t][part[0], part[1]] = grown
     return result
+
+
+def _around(inside: np.ndarray, margin: int) -> slice:
+    """Pixels [px] around the samples of a line that are inside; what lies farther off changes nothing."""
+    found = np.nonzero(inside)[0] // FINE
+    return slice(max(int(found[0]) - margin, 0), min(int(found[-1]) + margin + 1, len(inside) // FINE))
 
 
 def _signed_distance(inside: np.ndarray) -> np.ndarray:
