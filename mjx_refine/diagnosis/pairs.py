@@ -126,13 +126,20 @@ def _walled(
     """The best twos with a push once more with an obstacle in its place."""
     pushed = [one for one in found if "push" in one.names and one.lead > singles[0].lead][:WALLS]
     lines = [f"{_other(one, 'push')} and hidden_obstacle" for one in pushed]
-    rows = [(push_last(one.fit), shown(one.fit), base.cost) for one in pushed]
+    rows = [(push_last(one.fit), shown(one.fit), _without_push(base, singles, one)) for one in pushed]
     walls = walls_from_pushes(clip, rows, told, lines)
     return [
         Candidate(wall, lead_of(wall, base), one.promise)
         for wall, one in zip(walls, pushed, strict=True)
         if wall is not None
     ]
+
+
+def _without_push(base: Fit, singles: tuple[Candidate, ...], one: Candidate) -> float:
+    """What the other of two effects costs alone, or the base model where it was not fitted alone."""
+    k = one.names.index("push")
+    rest = (one.names[1 - k], one.targets[1 - k])
+    return next((c.fit.cost for c in singles if (c.names[0], c.targets[0]) == rest), base.cost)
 
 
 def _other(one: Candidate, name: str) -> str:

@@ -32,7 +32,7 @@ def walls_from_pushes(
 
     Args:
       clip: residuals.
-      pushes: the fits, what is seen of the clip, and what a hypothesis costs that they must not stay far behind.
+      pushes: the fits, what is seen of the clip, and what the hypothesis without the push costs.
       told: called with the line of a fit that is looked at.
       lines: one a fit.
     """
