@@ -16,6 +16,8 @@ from mjx_refine.effects.kind import Loads, Motion
 from mjx_refine.sim.model import SUBSTEPS
 
 
+# What diverges is told by its poses.
+@np.errstate(over="ignore", invalid="ignore")
 def stepped_rollout(
     workers_for: Callable[[int], rollout.Rollout],
     models: list[mujoco.MjModel],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -176,6 +177,15 @@ def test_dropped_and_doubled_frames(count, expected):
     state = {"gravity": GRAVITY, "linear_velocity": (1.0, 0.0, 2.0)}
     shown = rolled_out(effect("dropped_frames", frame=3, count=count), frames=6, **state)
     np.testing.assert_array_equal(shown, rolled_out(frames=9, **state)[expected])
+
+
+def test_a_rollout_that_diverges_does_so_in_silence():
+    batch = batch_with_effects([Scene((BALL,), CAMERA, (0.0, 0.0, -GRAVITY), effects=(effect("drag", "ball", quadratic=1.0),))])
+    fast = dataclasses.replace(batch, linear_velocity=np.full_like(batch.linear_velocity, 1e200))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        poses = MujocoSimulator(batch.shapes, 30.0).rollout(fast, 5)
+    assert not np.isfinite(poses[:, 1:]).all()
 
 
 def test_the_same_again_and_row_by_row():
