@@ -155,7 +155,10 @@ class ClipFit:
 
     def settle_noise(self, fit: Fit) -> None:
         """Sets the noise to what changes from frame to frame in the residuals of a fit, which no smooth misfit does."""
-        self.measured, self.counts = settled(self.measured, self.measured.split(fit.residual), self.counts)
+        # As they are: what the robust loss makes of large residuals changes less from frame to frame than they do.
+        prediction = self.predictor(self.poses(fit.hypothesis, fit.z[None]), fit.hypothesis.batch(fit.z[None]))
+        white = self.rigid(self.distances(prediction), None, 1e9)[0]
+        self.measured, self.counts = settled(self.measured, self.measured.split(white), self.counts)
         self.noise = everywhere(self.measured, self.frames)
 
     def allow_chaos(self, fit: Fit, seed: int) -> None:

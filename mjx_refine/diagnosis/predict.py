@@ -97,7 +97,19 @@ class Predictor:
         if count:
             focal = (self.image[1] / 2) / np.tan(batch.camera_fovy / 2)
             rate = np.gradient(reach, axis=1) if reach.shape[1] > 1 else np.zeros_like(reach)
-            view = OutlineView(reach, told[1], rate, directions(count), told[2], told[3], focal, self.image, self.fps)
+            view = OutlineView(
+                reach,
+                told[1],
+                rate,
+                directions(count),
+                told[2],
+                told[3],
+                focal,
+                self.image,
+                self.fps,
+                batch.shapes,
+                batch.size,
+            )
             change = acting.outline_change(batch, view)
             reach = (reach + change)[..., :: count // DIRECTIONS]
             whole = changed_moments(whole, batch, view, change)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
 
+from mjx_refine.diagnosis.cuts import cut_places
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.slack import spins, touching
 from mjx_refine.effects.kind import FitView
@@ -29,6 +30,8 @@ def view_of(
     on_floor = touching(batch, poses)
     plain = dataclasses.replace(batch, effects=())
     places = hidden_places(poses, plain, observation, masks_of) if hidden else ()
+    if hidden and observation.masks is not None:
+        places = (*cut_places(foreground(observation)), *places)
     return FitView(plain, poses, velocity, spin, on_floor, clip.measured.background, places, clip.image, fps)
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
 from mjx_refine.errors import InputError
+from mjx_refine.scene import Shape
 
 Channel = Literal["motion", "rotation", "shape", "camera", "timing", "perception"]
 
@@ -151,6 +152,8 @@ class OutlineView:
       focal: focal length [px].
       image: (width, height) [px].
       fps: frames a second.
+      shapes: of the objects.
+      size: MuJoCo's ``geom_size`` [m].
     """
 
     reach: Float[np.ndarray, "batch frames objects directions"]
@@ -162,6 +165,8 @@ class OutlineView:
     focal: Float[np.ndarray, "batch"]
     image: tuple[int, int]
     fps: float
+    shapes: tuple[Shape, ...]
+    size: Float[np.ndarray, "batch objects 3"]
 
 
 class EffectKind:

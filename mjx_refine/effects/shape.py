@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, OutlineView
+from mjx_refine.scene import Shape
 
 ORDERS = (2, 3, 4)
 COUNT = sum(2 * order + 1 for order in ORDERS)
 
 
 class OutlineShape(EffectKind):
-    """The body reaches farther than its primitive by a sum of polynomials of its normal n in its own frame.
+    """The body reaches farther than its primitive by a sum of polynomials of its normal n in its own frame; edges of boxes and
+    cylinders are worn to a radius, and these grow thinner along their z axis.
 
     The support function of the convex body becomes h(n) + sum of a_k P_k(n), P_k the monomials of degree 2, 3 and 4 that
-    span the harmonics of these degrees (Schneider, Convex Bodies, 3.3). Motion and contacts stay the primitive's.
+    span the harmonics of these degrees (Schneider, Convex Bodies, 3.3). With taper s the sides are (1 - s) of the
+    primitive's at its upper end and (1 + s) at its lower one; a body that a ball of radius r rolls around inside of (the opening
+    by the ball, where no side is shorter than 2 r) reaches r less far for every face, and r farther for itself. Motion and
+    contacts stay the primitive's.
     """
 
     name = "shape"
@@ -23,17 +29,47 @@ class OutlineShape(EffectKind):
     targeted = True
     channel = "shape"
     drawn = True
-    parameters = (EffectParameter("bulge", "m", 0.02, -1e2, 1e2, length=COUNT),)
+    parameters = (
+        EffectParameter("bulge", "m", 0.02, -1e2, 1e2, length=COUNT),
+        EffectParameter("rounding", "m", 0.02, 0.0, 1e2),
+        EffectParameter("taper", "1", 0.15, -0.9, 0.9),
+    )
 
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         added = np.zeros(view.reach.shape)
-        extra = (polynomials(view.facing[:, :, target]) * values[:, None, None]).sum(-1)
+        normal = view.facing[:, :, target]
+        extra = (polynomials(normal) * values[:, None, None, :COUNT]).sum(-1)
+        rounding, taper = values[:, None, None, COUNT], values[:, None, None, COUNT + 1]
+        extra = extra + worn(view.shapes[target], view.size[:, target], normal, rounding, taper)
         added[:, :, target] = extra * view.scale[:, :, target]
         return added
 
     def widths(self, view: FitView, target: int) -> np.ndarray:
         orders = np.repeat(ORDERS, [2 * order + 1 for order in ORDERS])
-        return 0.15 * float(view.batch.size[0, target].max()) * 2.0 / orders
+        size = view.batch.size[0, target]
+        return np.concatenate([0.3 * float(size.max()) / orders, [0.3 * float(size[size > 0].min()), 0.15]])
+
+
+def worn(
+    shape: Shape,
+    size: Float[np.ndarray, "batch 3"],
+    normal: Float[np.ndarray, "batch frames directions 3"],
+    rounding: Float[np.ndarray, "batch 1 1"],
+    taper: Float[np.ndarray, "batch 1 1"],
+) -> Float[np.ndarray, "batch frames directions"]:
+    """What tapered sides and round edges add to a primitive's support function at unit normals [m]."""
+    if shape == "sphere":
+        return np.zeros(normal.shape[:-1])
+    x, y, z = np.moveaxis(normal, -1, 0)
+    if shape == "box":
+        a, b, half = (size[:, None, None, k] for k in range(3))
+        across, faces = a * np.abs(x) + b * np.abs(y), np.abs(x) + np.abs(y)
+    else:
+        radius, half = (size[:, None, None, k] for k in range(2))
+        faces = np.hypot(x, y)
+        across = radius * faces
+    ends = np.maximum(half * z + (1 - taper) * across, -half * z + (1 + taper) * across)
+    return ends - half * np.abs(z) - across + rounding * (1 - faces - np.abs(z))
 
 
 def polynomials(normal: np.ndarray) -> np.ndarray:

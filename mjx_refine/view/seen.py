@@ -106,7 +106,10 @@ def outline_view(
     told = _outline(batch.shapes, padded(poses, batch), image, count)
     reach, contact, facing, scale = (np.asarray(a, np.float64)[: len(poses)] for a in told)
     rate = np.gradient(reach, axis=1) if reach.shape[1] > 1 else np.zeros_like(reach)
-    return OutlineView(reach, contact, rate, directions(count), facing, scale, focal_length(batch, image), image, fps)
+    focal = focal_length(batch, image)
+    return OutlineView(
+        reach, contact, rate, directions(count), facing, scale, focal, image, fps, batch.shapes, batch.size
+    )
 
 
 def seen_supports(

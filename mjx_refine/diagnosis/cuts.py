@@ -1,0 +1,134 @@
+"""Straight borders at which masks stop while their objects go on: something that is not in the scene hides the rest."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+FRAMES, MOVES = 3, 3.0
+"""In how many frames a mask must stop at the same line, and how far its other side or its middle must move meanwhile, across
+that line [px]."""
+
+FLAT, LEAST = 0.3, 8
+"""Part of the mask's extent along the line that must lie at it, and pixels."""
+
+LEAST_PIXELS = 30
+"""Of a mask that is looked at."""
+
+DEEP = 3
+"""How far nothing at all must be seen beyond the line [px]."""
+
+
+class Box(NamedTuple):
+    """A rectangle [px]."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+
+class _Edge(NamedTuple):
+    """Where a mask ends in one frame, seen along one axis.
+
+    Attributes:
+      at: the last line of pixels on the side that is looked at.
+      low, high: where the mask lies at that line.
+      opposite: the last line on the other side.
+      middle: the centroid's line.
+    """
+
+    at: int
+    low: int
+    high: int
+    opposite: int
+    middle: float
+
+
+def cut_places(masks: Int[np.ndarray, "frames height width"], most: int = 2) -> tuple[Box, ...]:
+    """Rectangles that would hide what lies beyond such borders, those of the most frames first.
+
+    Args:
+      masks: ids, 0: nothing.
+      most: how many rectangles are told.
+    """
+    seen = (masks > 0).any(0)
+    found: list[tuple[int, Box]] = []
+    for i in np.unique(masks[masks > 0]):
+        for axis in (0, 1):
+            for sign in (-1, 1):
+                # Seen so that the line is a row and the mask lies below it.
+                turned = masks if axis == 0 else masks.transpose(0, 2, 1)
+                turned = turned if sign < 0 else turned[:, ::-1]
+                told = _cut(turned, int(i))
+                if told is None:
+                    continue
+                frames, row, low, high, extent = told
+                empty = seen if axis == 0 else seen.T
+                empty = ~(empty if sign < 0 else empty[::-1])
+                top, low, high = _grown(empty, row, low, high, extent)
+                rows = (top, row) if sign < 0 else (turned.shape[1] - row, turned.shape[1] - top)
+                if row - top < DEEP:
+                    continue
+                box = Box(low, rows[0], high, rows[1]) if axis == 0 else Box(rows[0], low, rows[1], high)
+                found.append((frames, Box(*(float(v) for v in box))))
+    return tuple(box for _, box in sorted(found, key=lambda one: -one[0])[:most])
+
+
+def _cut(masks: Int[np.ndarray, "frames height width"], i: int) -> tuple[int, int, int, int, int] | None:
+    """(frames, row, first and last column, extent down) of the row at which a mask's upper side stands still, or None."""
+    edges = [_edge(frame, i) for frame in masks]
+    there = [edge for edge in edges if edge is not None]
+    best: list[_Edge] = []
+    for row in {edge.at for edge in there}:
+        near = [edge for edge in there if abs(edge.at - row) <= 1]
+        if len(near) > len(best) and _moves(near):
+            best = near
+    if len(best) < FRAMES:
+        return None
+    rows = [np.nonzero((frame == i).any(1))[0] for frame in masks]
+    extent = max(int(r[-1] - r[0]) + 1 for r in rows if len(r))
+    row = int(np.median([edge.at for edge in best]))
+    return len(best), row, min(edge.low for edge in best), max(edge.high for edge in best) + 1, extent
+
+
+def _moves(edges: list[_Edge]) -> bool:
+    """Whether something moves across the line that these share."""
+    return max(np.ptp([edge.opposite for edge in edges]), np.ptp([edge.middle for edge in edges])) > MOVES
+
+
+def _edge(frame: Int[np.ndarray, "height width"], i: int) -> _Edge | None:
+    """The upper side of a mask, or None where it is not flat, at the border, or beside another mask."""
+    mask = frame == i
+    rows = np.nonzero(mask.any(1))[0]
+    if not len(rows) or rows[0] < 2 or mask.sum() < LEAST_PIXELS:
+        return None
+    columns = np.nonzero(mask.any(0))[0]
+    # Borders are noisy: of three rows the one where most of the mask lies.
+    upper = mask[rows[0] : rows[0] + 3]
+    deep = int(np.argmax(upper.sum(1) > 0.5 * upper.sum(1).max()))
+    flat = np.nonzero(upper[deep])[0]
+    if len(flat) < max(LEAST, FLAT * len(columns)):
+        return None
+    above = frame[max(rows[0] - 3, 0) : rows[0] + deep, flat[0] : flat[-1] + 1]
+    if ((above > 0) & (above != i)).any():
+        return None
+    middle = float((mask.sum(1) * np.arange(len(mask))).sum() / mask.sum())
+    return _Edge(int(rows[0] + deep), int(flat[0]), int(flat[-1]), int(rows[-1]), middle)
+
+
+def _grown(empty: Bool[np.ndarray, "height width"], row: int, low: int, high: int, extent: int) -> tuple[int, int, int]:
+    """(top row, first column, column after the last) of a rectangle above ``row``, as wide as nothing is ever seen in it."""
+    top = row
+    while top > max(row - extent, 0) and empty[top - 1, low:high].all():
+        top -= 1
+    # The rows next to the border hold its noise.
+    inside = empty[top : max(row - 1, top + 1)]
+    first, last = low, high
+    while first > max(low - extent, 0) and inside[:, first - 1].all():
+        first -= 1
+    while last < min(high + extent, empty.shape[1]) and inside[:, last].all():
+        last += 1
+    return top, first, last
