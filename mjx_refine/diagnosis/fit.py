@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -160,6 +161,15 @@ class ClipFit:
         white = self.rigid(self.distances(prediction), None, 1e9)[0]
         self.measured, self.counts = settled(self.measured, self.measured.split(white), self.counts)
         self.noise = everywhere(self.measured, self.frames)
+
+    def leave_out(self, told: Measured) -> bool:
+        """Leaves out what ``told`` does not tell of outlines and whole masks; whether that is anything."""
+        m = self.measured
+        reach, moments = (np.where(np.isnan(b), np.nan, a) for a, b in ((m.reach, told.reach), (m.moments, told.moments)))
+        self.measured = dataclasses.replace(m, reach=reach, moments=moments)
+        self.__dict__.pop("facts", None)
+        left = np.isfinite(m.reach).sum() + np.isfinite(m.moments).sum()
+        return bool(np.isfinite(reach).sum() + np.isfinite(moments).sum() < left)
 
     def allow_chaos(self, fit: Fit, seed: int) -> None:
         """Adds the rollout's own jaggedness around a fit to the noise, as far as the fit leaves something of it.

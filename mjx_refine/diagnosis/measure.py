@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 
 from mjx_refine.observation import Observation
-from mjx_refine.search.features import flow_points, outlines
+from mjx_refine.search.features import NEAR, flow_points, outlines
 from mjx_refine.view.moments import whole_masks
 from mjx_refine.view.tiles import foreground
 
@@ -107,20 +107,21 @@ class Measured:
         return Parts(*(piece.reshape(part.shape) for piece, part in zip(pieces, self.parts, strict=True)))
 
 
-def measure(observation: Observation, columns: tuple[int, ...]) -> Measured:
+def measure(observation: Observation, columns: tuple[int, ...], near: int = NEAR) -> Measured:
     """Measures a clip.
 
     Args:
       observation: the clip.
       columns: for each object the position of its id among the masks' ids, or -1.
+      near: how near another mask may cut an outline [px].
     """
     masks = foreground(observation)
-    seen = outlines(masks)
+    seen = outlines(masks, near=near)
     pixels, flow = flow_points(masks, observation.flow, seen.ids)
     chosen, lost = [max(j, 0) for j in columns], np.array([j < 0 for j in columns])
     reach = np.where(lost[None, :, None], np.nan, seen.support[:, chosen])
     flow = np.where(lost[None, :, None, None], np.nan, flow[:-1, chosen])
-    moments = np.where(lost[None, :, None], np.nan, whole_masks(masks, seen.ids)[:, chosen])
+    moments = np.where(lost[None, :, None], np.nan, whole_masks(masks, seen.ids, near)[:, chosen])
     places, background = _beside(masks, observation.flow)
     sigma = observation.flow_sigma
     given = float(np.nanmedian(sigma)) if sigma is not None else 0.0

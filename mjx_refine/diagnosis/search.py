@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -13,6 +14,7 @@ from mjx_refine.diagnosis.exchange import Fitted, Key, at_least_nothing, exchang
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import beginning, chosen_of
+from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.pairs import Told, pairs_of
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
@@ -22,6 +24,7 @@ from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene
+from mjx_refine.search.features import NEAR
 
 FAMILIES = 7
 """Families (effect and target) that are fitted in full, the most promising first."""
@@ -47,6 +50,9 @@ many effects are fitted again with less."""
 SETTLINGS, SETTLED = 8, 0.8
 """How often the noise is then taken anew from what changes from frame to frame, unless that leaves this part of it: one look
 takes off less than half, and a camera that shakes had made twenty times too much of it."""
+
+THIN = 1.0
+"""How much too thin masks are from which on those of objects that hide one another do not touch [px]."""
 
 FORGIVING = 40.0
 """Scale of the robust loss while a fit is far off [noise widths]."""
@@ -88,6 +94,9 @@ def compare(
     base = clip.fit(base.hypothesis, base.z, 10)
     names = [name for name in catalogue() if name not in without]
     base, singles = _singles(clip, base, names, scene, observation, masks_of, seed, told)
+    if (thin := thinness(singles)) > THIN and clip.leave_out(_may_be_cut(clip, observation, masks_of, thin)):
+        told("thin masks, without what other objects may hide of them")
+        base, singles, impacts = _again(clip, base, singles, seed)
     if singles and singles[0].lead > CLEAR and clip.misfit(singles[0].fit) < TOO_QUIET:
         told("noise, once more")
         base, singles, impacts = _again(clip, base, singles, seed)
@@ -226,6 +235,23 @@ def _again(
         dataclasses.replace(one, fit=fit, lead=lead_of(fit, base)) for one, fit in zip(singles, fits, strict=False)
     ]
     return base, in_order(clip, found), impacts
+
+
+def thinness(singles: tuple[Candidate, ...]) -> float:
+    """By how much masks are too thin where that explains a clip best [px]."""
+    if not singles or singles[0].names != ("mask_bias",) or singles[0].lead < CLEAR:
+        return 0.0
+    fit = singles[0].fit
+    return -float(fit.hypothesis.values(fit.z[None], 0)[0, 0])
+
+
+def _may_be_cut(clip: ClipFit, observation: Observation, masks_of: tuple[int, ...], thin: float) -> Measured:
+    """The clip measured as if masks this far apart touched: so far apart are those of objects of which one hides the other."""
+    if observation.masks is None:
+        return clip.measured
+    ids = [int(i) for i in np.unique(observation.masks) if i != 0]
+    columns = tuple(ids.index(i) if i in ids else -1 for i in masks_of)
+    return measure(observation, columns, NEAR + math.ceil(2 * thin))
 
 
 def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:

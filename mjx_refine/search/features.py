@@ -12,6 +12,9 @@ from mjx_refine.view.outline import directions
 
 DIRECTIONS = 16
 MIN_PIXELS = 12
+NEAR = 2
+"""How near to the border or to another mask an outline may be cut by it [px]."""
+
 LEADING = 10
 PART = 0.28
 """The gap to the outline, in distances between the first and the tenth pixel centre."""
@@ -35,8 +38,8 @@ class Outlines:
     area: Float[np.ndarray, "frames masks"]
 
 
-def outlines(masks: Int[np.ndarray, "frames height width"], count: int = DIRECTIONS) -> Outlines:
-    """Measures every mask in every frame."""
+def outlines(masks: Int[np.ndarray, "frames height width"], count: int = DIRECTIONS, near: int = NEAR) -> Outlines:
+    """Measures every mask in every frame; what another mask comes within ``near`` pixels of, it may cut."""
     ids = [int(i) for i in np.unique(masks) if i != 0]
     length = len(masks)
     support = np.full((length, len(ids), count), np.nan)
@@ -44,21 +47,21 @@ def outlines(masks: Int[np.ndarray, "frames height width"], count: int = DIRECTI
     area = np.zeros((length, len(ids)))
     for t, frame in enumerate(masks):
         for j, i in enumerate(ids):
-            measured = _measure(frame, i, directions(count))
+            measured = _measure(frame, i, directions(count), near)
             if measured is not None:
                 area[t, j], centre[t, j], support[t, j] = measured
     return Outlines(tuple(ids), support, centre, area)
 
 
-def _measure(frame: np.ndarray, i: int, normals: np.ndarray):
+def _measure(frame: np.ndarray, i: int, normals: np.ndarray, near: int):
     """(area, centroid, support) of one mask in one frame, or None where it is absent."""
     height, width = frame.shape
     box = _box(frame, i)
     if box is None:
         return None
-    # Only the mask's surroundings are looked at: two pixels beyond its box.
-    top, left = (max(side.start - 2, 0) for side in box)
-    part = frame[top : box[0].stop + 2, left : box[1].stop + 2]
+    # Only the mask's surroundings are looked at.
+    top, left = (max(side.start - near, 0) for side in box)
+    part = frame[top : box[0].stop + near, left : box[1].stop + near]
     mask = part == i
     area = int(np.count_nonzero(mask))
     rows, columns = np.nonzero(mask)
@@ -68,9 +71,9 @@ def _measure(frame: np.ndarray, i: int, normals: np.ndarray):
     along = np.stack([columns + left + 0.5, rows + top + 0.5], -1) @ normals.T
     extreme = along.argmax(0)
     reach = along.max(0) + _beyond(along, normals)
-    others = ndimage.maximum_filter(np.where(mask, 0, part), size=5)[rows[extreme], columns[extreme]] > 0
+    others = ndimage.maximum_filter(np.where(mask, 0, part), size=2 * near + 1)[rows[extreme], columns[extreme]] > 0
     rows, columns = rows[extreme] + top, columns[extreme] + left
-    cut = (rows < 2) | (columns < 2) | (rows >= height - 2) | (columns >= width - 2) | others
+    cut = (rows < NEAR) | (columns < NEAR) | (rows >= height - NEAR) | (columns >= width - NEAR) | others
     return area, centre, np.where(cut, np.nan, reach)
 
 

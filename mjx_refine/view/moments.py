@@ -175,10 +175,12 @@ def moments(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]) -
     return moments_of(shapes, place(shapes, arrays, image), image)
 
 
-def mask_moments(masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...], least: int = 12) -> Moments:
+def mask_moments(
+    masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...], least: int = 12, near: int = 2
+) -> Moments:
     """Moments of observed masks, (frames, ids), float64; NaN where they cannot be the whole silhouette's.
 
-    That is where the mask has fewer than ``least`` pixels, or comes within two of the border or of another mask.
+    That is where the mask has fewer than ``least`` pixels, or comes within two of the border or ``near`` of another mask.
     """
     shape = (len(masks), len(ids))
     area, centroid, second = np.full(shape, np.nan), np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan)
@@ -189,9 +191,10 @@ def mask_moments(masks: Int[np.ndarray, "frames height width"], ids: tuple[int, 
                 continue
             if rows.max() >= frame.shape[0] - 2 or columns.max() >= frame.shape[1] - 2:
                 continue
-            part = frame[rows.min() - 2 : rows.max() + 3, columns.min() - 2 : columns.max() + 3]
-            near = ndimage.binary_dilation(part == i, np.ones((5, 5)))
-            if (near & (part != i) & (part != 0)).any():
+            top, left = max(rows.min() - near, 0), max(columns.min() - near, 0)
+            part = frame[top : rows.max() + near + 1, left : columns.max() + near + 1]
+            around = ndimage.maximum_filter(part == i, size=2 * near + 1)
+            if (around & (part != i) & (part != 0)).any():
                 continue
             points = np.stack([columns + 0.5, rows + 0.5], -1)
             area[t, j], centroid[t, j] = len(points), points.mean(0)
@@ -200,10 +203,10 @@ def mask_moments(masks: Int[np.ndarray, "frames height width"], ids: tuple[int, 
 
 
 def whole_masks(
-    masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...]
+    masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...], near: int = 2
 ) -> Float[np.ndarray, "frames ids 3"]:
     """Centroid and equivalent radius, that of a disc as large, of masks that are seen whole [px]; NaN elsewhere."""
-    found = mask_moments(masks, ids)
+    found = mask_moments(masks, ids, near=near)
     return np.concatenate([found.centroid, np.sqrt(found.area / np.pi)[..., None]], -1)
 
 
