@@ -89,7 +89,8 @@ def _middle(values: np.ndarray) -> float:
 
 
 def settled(measured: Measured, residual: Parts, counts: Counts) -> tuple[Measured, Counts]:
-    """What changes from frame to frame in the residuals of a fit, which no smooth misfit does, taken for the noise.
+    """What bends from frame to frame in the residuals of a fit, as no smooth misfit does, taken for the noise: second
+    differences, since the first ones of a large misfit are large as well.
 
     Args:
       measured: with the noise in whose widths the residuals are.
@@ -103,7 +104,7 @@ def settled(measured: Measured, residual: Parts, counts: Counts) -> tuple[Measur
         # Masks that stand still say nothing of their noise.
         moving = fresh[: len(series)].reshape(*fresh[: len(series)].shape, *(1,) * (series.ndim - 2))
         step = np.where(np.isfinite(seen) & moving, series, np.nan)
-        square = np.diff(step, axis=0) ** 2 / 2 / part
+        square = np.diff(step, 2, axis=0) ** 2 / 6 / part
         return np.array([np.sqrt(_middle(square[:, n]) / 0.455) for n in range(series.shape[1])])
 
     edge = m.edge_noise * np.clip(rough(residual.reach, m.reach, share[0]), 0.4, 1.5)

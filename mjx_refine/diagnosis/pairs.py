@@ -30,8 +30,14 @@ JOINED, TOGETHER = 5, 4
 """Of how many of the best effects twos are put together, and how many twos, those whose leads add up to the most: what each
 found alone is a better place to begin than a linear look from a fit that has bent to the other effect."""
 
-ITERATIONS = 7
-"""Of least squares of two effects."""
+PARTS = ((1.0, 1.0), (0.5, 0.5), (1.0, 0.3), (0.3, 1.0), (0.7, 0.7))
+"""How much of each of two effects their common fit begins with: alone, each explains part of what is the other's."""
+
+ITERATIONS, FINALISTS, MORE_ITERATIONS = 7, 3, 10
+"""Of least squares of two effects; how many of the best twos go on from there, and for how many more."""
+
+ROAMING = 2
+"""How many of the best twos look beyond where least squares ended: they end a few tens of evidence apart by chance."""
 
 WALLS = 2
 """How many of the best twos with a push are looked at with an obstacle in its place."""
@@ -69,14 +75,40 @@ def pairs_of(
     rows = [(hypothesis, z, min(first.fit.cost, second.fit.cost)) for hypothesis, z, first, second in together]
     fits = clip.crew.each(clip, _joined, rows, told, lines)
     found += [Candidate(fit, lead_of(fit, base), 0.0) for fit in fits]
-    found.sort(key=lambda one: -one.lead)
+    found = _gone_on(clip, base, found)
     if "hidden_obstacle" in names:
         found += _walled(clip, base, singles, found, shown, told)
         found.sort(key=lambda one: -one.lead)
-    if found and found[0].lead > singles[0].lead:
-        fit = clip.roam(found[0].fit, seed, ROAMED_AGAIN)
-        found[0] = dataclasses.replace(found[0], fit=fit, lead=lead_of(fit, base))
+    best = [one for one in _differing(found)[:ROAMING] if one.lead > singles[0].lead]
+    fits = clip.crew.each(clip, _roamed, [(one.fit, seed) for one in best])
+    found = [one for one in found if not any(one is other for other in best)]
+    found += [dataclasses.replace(one, fit=fit, lead=lead_of(fit, base)) for one, fit in zip(best, fits, strict=True)]
     return in_order(clip, found)
+
+
+def _differing(found: list[Candidate]) -> list[Candidate]:
+    """The best of each two effects, in their order."""
+    kept: dict[tuple, Candidate] = {}
+    for one in found:
+        kept.setdefault(tuple(sorted(zip(one.names, one.targets, strict=True))), one)
+    return list(kept.values())
+
+
+def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
+    return clip.roam(fit, seed, ROAMED_AGAIN)
+
+
+def _gone_on(clip: ClipFit, base: Fit, found: list[Candidate]) -> list[Candidate]:
+    """The twos in their order, the best of them at the end of their least squares."""
+    found = sorted(found, key=lambda one: -one.lead)
+    fits = clip.crew.each(clip, _further, [(one.fit,) for one in found[:FINALISTS]])
+    best = [dataclasses.replace(one, fit=fit, lead=lead_of(fit, base)) for one, fit in zip(found, fits, strict=False)]
+    return sorted([*best, *found[FINALISTS:]], key=lambda one: -one.lead)
+
+
+def _further(clip: ClipFit, fit: Fit) -> Fit:
+    further = clip.fit(fit.hypothesis, fit.z, MORE_ITERATIONS)
+    return further if further.evidence > fit.evidence else fit
 
 
 def _beside(
@@ -111,7 +143,8 @@ def _together(
         hypothesis = one.fit.hypothesis.added(other.fit.hypothesis.terms[-1])
         first, second = one.fit.z, other.fit.z
         grounds = [first[:count], second[:count], first[:count] + second[:count] - base.z]
-        points = np.array([np.concatenate([z, first[count:], second[count:]]) for z in grounds])
+        parts = [(a * first[count:], b * second[count:]) for a, b in PARTS]
+        points = np.array([np.concatenate([z, *two]) for z in grounds for two in parts])
         yield hypothesis, clip.best_of(hypothesis, points), one, other
 
 
