@@ -114,7 +114,7 @@ def lefts(
 ) -> tuple[float, ...] | None:
     """What is left of each effect [px], the others being known; None as soon as some refit leaves less than `least` of one.
 
-    By the fits from the truth alone, a third of `left`'s search: what that finds may be less.
+    Without `left`'s starts from the prior, which find less now and then.
     """
     found = []
     with engine() as opened:

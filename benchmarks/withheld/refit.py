@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -158,6 +161,16 @@ class Refit:
             drawn[form.target] = solids.another(scene[form.target], how["form"], how["strength"], np.array(how["lean"]))
         return Film(self._kept[1], view, tuple(drawn))
 
+    @contextlib.contextmanager
+    def partly(self, part: float) -> Iterator[None]:
+        """Inside, what is fitted lies this part of the way from what is seen without the unknown effects to what is seen."""
+        whole, plain = self.target, self.seen(np.zeros(len(self.base.numbers)))
+        self.target = Seen(*(a + part * (b - a) for a, b in ((plain.reach, whole.reach), (plain.flow, whole.flow))))
+        try:
+            yield
+        finally:
+            self.target = whole
+
     def seen(self, shifts: Float[np.ndarray, "numbers"]) -> Seen:
         """What is seen of the model."""
         return seen(self.film(shifts), self.known, self.radii, self.hidden)
@@ -226,20 +239,23 @@ COARSE, FINE = 0.05, 0.001  # steps, in widths: contacts make the misfit jagged,
 DIRECT = (Leg(step=COARSE),)
 ANNEALED = (Leg(blur=10.0, step=COARSE), Leg(blur=3.0, step=COARSE), Leg())
 GROWING = (Leg(10, 3.0), Leg(20, 3.0), Leg())
+PARTS, CARRIED = (0.33, 0.67, 1.0), (Leg(step=0.02), Leg())  # of the effect, one after the other; steps of each
 DRAWS = 4  # starts from the prior
 HOPS = (0.5, 0.15)  # starts beside the best end so far, so many widths off
+IDLE, WORTH = 3, 0.9  # so many hops in a row that end no lower than this part of the lowest cost end the search
 NOTHING = 0.5  # px: with less left, no further start is tried
 
 
 def best(refit: Refit, rng: np.random.Generator, enough: float = 0.0, draws: int = DRAWS) -> tuple[Fit, list[float]]:
     """The lowest of several fits, and all their costs in order.
 
-    The starts: the truth at once; the truth with raised noise; the truth with more and more frames; draws of the prior
-    with raised noise; points beside the best end so far. Between them the best end is refined by other steps.
+    The starts: the truth at once; the truth, carried along while the effect grows; the truth with raised noise; the truth with
+    more and more frames; draws of the prior with raised noise; points beside the best end so far, as long as they lead
+    lower. Between them the best end is refined by other steps.
 
     Args:
       refit: what is fitted. rng: of the draws. enough: an end with less left of the outlines [px] ends the search, too.
-      draws: how many starts from the prior; with none, the search ends with the fits from the truth.
+      draws: how many starts from the prior.
     """
     zero = np.zeros(len(refit.base.numbers))
     ends: list[Fit] = []
@@ -253,13 +269,22 @@ def best(refit: Refit, rng: np.random.Generator, enough: float = 0.0, draws: int
     def from_best(hop: float, step: float) -> bool:
         return along(least(ends).shifts + rng.normal(0, hop, len(zero)), (Leg(step=step),))
 
-    done = along(zero, DIRECT) or from_best(0, FINE) or along(zero, ANNEALED) or along(zero, GROWING)
-    done = done or not draws
+    def carried() -> bool:
+        start = zero
+        for part in PARTS:
+            with refit.partly(part):
+                start = refit.descend(start, CARRIED[0])
+        return along(start, CARRIED[1:])
+
+    done = along(zero, DIRECT) or carried() or from_best(0, FINE) or along(zero, ANNEALED) or along(zero, GROWING)
     for _ in range(draws):
         done = done or along(rng.normal(size=len(zero)), ANNEALED)
     done = done or from_best(0, FINE)
-    for hop in HOPS:
-        done = done or from_best(hop, Leg().step)
+    idle, hops = 0, itertools.cycle(HOPS)
+    while not done and idle < IDLE:
+        lowest = least(ends).cost
+        done = from_best(next(hops), Leg().step)
+        idle = 0 if least(ends).cost < WORTH * lowest else idle + 1
     if not done:
         from_best(0, FINE)
     return least(ends), [round(end.cost, 1) for end in ends]
