@@ -6,9 +6,12 @@ begin again from what the best of the others found for the parameters that they 
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.knock import knocked
 
 SOURCES = 3
 """How many fits give their base parameters."""
@@ -21,6 +24,9 @@ ITERATIONS = 6
 
 NEAR = 1.3
 """How much a point may cost, as a multiple of the hypothesis' own fit, for least squares to begin there."""
+
+ALONE = 10
+"""Of one of two effects, from what both found together."""
 
 Key = tuple[str, int]
 Fitted = dict[Key, tuple[Fit, float]]
@@ -63,3 +69,12 @@ def _of_nothing(clip: ClipFit, base: Fit, fit: Fit) -> Fit:
     nothing = np.zeros(len(fit.z) - len(base.z))
     there = clip.at(fit.hypothesis, np.concatenate([base.z, nothing]))
     return there if there.evidence > fit.evidence else fit
+
+
+def alone(clip: ClipFit, fit: Fit, k: int) -> Fit:
+    """Effect ``k`` of several by itself, fitted from what they found together."""
+    hypothesis, count = fit.hypothesis, fit.hypothesis.space.dimension
+    ends = count + np.cumsum([int(t.free.sum()) for t in hypothesis.terms])
+    own = fit.z[ends[k] - int(hypothesis.terms[k].free.sum()) : ends[k]]
+    single = dataclasses.replace(hypothesis, terms=(hypothesis.terms[k],))
+    return knocked(clip, clip.fit(single, np.concatenate([fit.z[:count], own]), ALONE))

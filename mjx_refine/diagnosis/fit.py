@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -154,22 +153,19 @@ class ClipFit:
             )
         )
 
-    def settle_noise(self, fit: Fit) -> None:
-        """Sets the noise to what changes from frame to frame in the residuals of a fit, which no smooth misfit does."""
-        # As they are: what the robust loss makes of large residuals changes less from frame to frame than they do.
-        prediction = self.predictor(self.poses(fit.hypothesis, fit.z[None]), fit.hypothesis.batch(fit.z[None]))
-        white = self.rigid(self.distances(prediction), None, 1e9)[0]
-        self.measured, self.counts = settled(self.measured, self.measured.split(white), self.counts)
+    def settle_noise(self, fit: Fit, order: int = 2) -> None:
+        """Sets the noise to what changes from frame to frame in the residuals of a fit, in differences of this order."""
+        told = self.predictor(self.poses(fit.hypothesis, fit.z[None]), fit.hypothesis.batch(fit.z[None]))
+        # As they are: what the robust loss makes of large residuals bends less than they do.
+        white = self.rigid(self.distances(told), None, 1e9)[0]
+        self.measured, self.counts = settled(self.measured, self.measured.split(white), self.counts, order)
         self.noise = everywhere(self.measured, self.frames)
 
     def leave_out(self, told: Measured) -> bool:
         """Leaves out what ``told`` does not tell of outlines and whole masks; whether that is anything."""
-        m = self.measured
-        reach, moments = (np.where(np.isnan(b), np.nan, a) for a, b in ((m.reach, told.reach), (m.moments, told.moments)))
-        self.measured = dataclasses.replace(m, reach=reach, moments=moments)
+        before, self.measured = self.measured, self.measured.without_what_lacks(told)
         self.__dict__.pop("facts", None)
-        left = np.isfinite(m.reach).sum() + np.isfinite(m.moments).sum()
-        return bool(np.isfinite(reach).sum() + np.isfinite(moments).sum() < left)
+        return self.measured.count < before.count
 
     def allow_chaos(self, fit: Fit, seed: int) -> None:
         """Adds the rollout's own jaggedness around a fit to the noise, as far as the fit leaves something of it.
@@ -344,10 +340,9 @@ class ClipFit:
 
     @remembered
     def hop(self, fit: Fit, seed: int, rounds: int = 3, count: int = 64, keep=None, scale: float = SCALE) -> Fit:
-        """Least squares again from better points around its end.
+        """Least squares again from better points around its end: draws from the fit's own posterior at several widths.
 
-        After contacts the residuals are jagged, and derivatives see only the nearest step. Draws from the fit's own
-        posterior at several widths look beyond; each round least squares goes on from the best of them.
+        After contacts the residuals are jagged, and derivatives see only the nearest step.
         """
         generator = np.random.default_rng(seed)
         low, high = fit.hypothesis.bounds

@@ -100,6 +100,16 @@ class Measured:
         """All that predictions are compared with."""
         return Parts(self.reach, self.flow, self.moments, self.background)
 
+    @property
+    def count(self) -> int:
+        """How many numbers are known of outlines and whole masks."""
+        return int(np.isfinite(self.reach).sum() + np.isfinite(self.moments).sum())
+
+    def without_what_lacks(self, told: Measured) -> Measured:
+        """The same, but for outlines and whole masks of which ``told`` knows nothing."""
+        reach = np.where(np.isnan(told.reach), np.nan, self.reach)
+        return dataclasses.replace(self, reach=reach, moments=np.where(np.isnan(told.moments), np.nan, self.moments))
+
     def split(self, row: Float[np.ndarray, "residuals"]) -> Parts:
         """A row of ``Parts.flat`` in its parts again."""
         ends = np.cumsum([part.size for part in self.parts])[:-1]

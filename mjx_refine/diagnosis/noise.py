@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Float
@@ -88,14 +89,15 @@ def _middle(values: np.ndarray) -> float:
     return float(np.median(values)) if len(values) else 0.455
 
 
-def settled(measured: Measured, residual: Parts, counts: Counts) -> tuple[Measured, Counts]:
-    """What bends from frame to frame in the residuals of a fit, as no smooth misfit does, taken for the noise: second
-    differences, since the first ones of a large misfit are large as well.
+def settled(measured: Measured, residual: Parts, counts: Counts, order: int = 1) -> tuple[Measured, Counts]:
+    """What changes from frame to frame in the residuals of a fit, which no smooth misfit does, taken for the noise.
 
     Args:
       measured: with the noise in whose widths the residuals are.
       residual: of the fit, without leading axis.
       counts: which the residuals were weighted with.
+      order: of the differences. Large smooth misfits have large first ones; measurements that err smoothly have small second
+        ones.
     """
     m, share = measured, counts.of(measured.parts)
     fresh = m.freshness > 0.5
@@ -104,7 +106,7 @@ def settled(measured: Measured, residual: Parts, counts: Counts) -> tuple[Measur
         # Masks that stand still say nothing of their noise.
         moving = fresh[: len(series)].reshape(*fresh[: len(series)].shape, *(1,) * (series.ndim - 2))
         step = np.where(np.isfinite(seen) & moving, series, np.nan)
-        square = np.diff(step, 2, axis=0) ** 2 / 6 / part
+        square = np.diff(step, order, axis=0) ** 2 / math.comb(2 * order, order) / part
         return np.array([np.sqrt(_middle(square[:, n]) / 0.455) for n in range(series.shape[1])])
 
     edge = m.edge_noise * np.clip(rough(residual.reach, m.reach, share[0]), 0.4, 1.5)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_refine.diagnosis.base import base_space, stored_base
 from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_of
-from mjx_refine.diagnosis.exchange import Fitted, Key, at_least_nothing, exchanged
+from mjx_refine.diagnosis.exchange import Fitted, Key, alone, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import beginning, chosen_of
@@ -43,9 +43,11 @@ best two families, and all that ended within 60 of the best, were below that."""
 ROAMING, HOPELESS = 2, -30.0
 """How many effects' fits look beyond where least squares ended, and the lead below which none does."""
 
-CLEAR, TOO_QUIET, KEPT = 40.0, 0.35, 6
-"""Lead of an effect, and mean square residual that it leaves, from which the noise must have been taken for too large; how
-many effects are fitted again with less."""
+CLEAR, KEPT = 40.0, 6
+"""Lead of an effect from which the noise is taken anew from what it leaves, and how many effects are fitted again with that."""
+
+TOGETHER = 2
+"""Of how many of the best twos each effect is fitted by itself once more."""
 
 SETTLINGS, SETTLED = 8, 0.8
 """How often the noise is then taken anew from what changes from frame to frame, unless that leaves this part of it: one look
@@ -97,11 +99,11 @@ def compare(
     if (thin := thinness(singles)) > THIN and clip.leave_out(_may_be_cut(clip, observation, masks_of, thin)):
         told("thin masks, without what other objects may hide of them")
         base, singles, impacts = _again(clip, base, singles, seed)
-    if singles and singles[0].lead > CLEAR and clip.misfit(singles[0].fit) < TOO_QUIET:
+    if singles and singles[0].lead > CLEAR:
         told("noise, once more")
         base, singles, impacts = _again(clip, base, singles, seed)
     pairs = pairs_of(clip, base, singles, names, lambda fit: view_of(clip, fit, observation, masks_of), seed, told)
-    return Compared(base, singles, pairs, impacts)
+    return Compared(base, _as_found_together(clip, base, singles, pairs), pairs, impacts)
 
 
 def _singles(
@@ -147,6 +149,20 @@ def _singles(
     fitted = at_least_nothing(clip, base, fitted)
     finals = [Candidate(fit, lead_of(fit, base), promise) for fit, promise in fitted.values()]
     return base, in_order(clip, finals)
+
+
+def _as_found_together(
+    clip: ClipFit, base: Fit, singles: tuple[Candidate, ...], pairs: tuple[Candidate, ...]
+) -> tuple[Candidate, ...]:
+    """The single effects; where the best two found better ordinary numbers for one of them, with these."""
+    rows = [(pair.fit, k) for pair in pairs[:TOGETHER] if pair.lead > singles[0].lead for k in range(len(pair.names))]
+    found = {(one.names, one.targets): one for one in singles}
+    for fit in clip.crew.each(clip, alone, rows):
+        one = Candidate(fit, lead_of(fit, base), 0.0)
+        old = found.get((one.names, one.targets))
+        if old is None or one.lead > old.lead:
+            found[one.names, one.targets] = one if old is None else dataclasses.replace(one, promise=old.promise)
+    return in_order(clip, list(found.values()))
 
 
 def _keep(fitted: Fitted, key: Key, fit: Fit, promise: float) -> None:
@@ -219,11 +235,11 @@ def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: Fitted, walled: list[Fi
 def _again(
     clip: ClipFit, base: Fit, singles: tuple[Candidate, ...], seed: int
 ) -> tuple[Fit, tuple[Candidate, ...], int]:
-    """All fits once more with the noise that the best effect leaves: what it explains had been taken for noise before."""
+    """All fits once more with the noise that the best effect leaves, in whose changes from frame to frame is little misfit."""
     best = singles[0].fit
     for _ in range(SETTLINGS):
         taken = clip.measured.moment_noise
-        clip.settle_noise(best)
+        clip.settle_noise(best, order=1)
         best = clip.at(best.hypothesis, best.z)
         if np.all(clip.measured.moment_noise > SETTLED * taken):
             break

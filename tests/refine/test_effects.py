@@ -180,7 +180,9 @@ def test_dropped_and_doubled_frames(count, expected):
 
 
 def test_a_rollout_that_diverges_does_so_in_silence():
-    batch = batch_with_effects([Scene((BALL,), CAMERA, (0.0, 0.0, -GRAVITY), effects=(effect("drag", "ball", quadratic=1.0),))])
+    batch = batch_with_effects(
+        [Scene((BALL,), CAMERA, (0.0, 0.0, -GRAVITY), effects=(effect("drag", "ball", quadratic=1.0),))]
+    )
     fast = dataclasses.replace(batch, linear_velocity=np.full_like(batch.linear_velocity, 1e200))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -166,7 +166,7 @@ class PosesFit(ClipFit):
         told = (self.place, self.quaternion, self.measured.moments, self.measured.reach, self.weight)
         return fingerprint(told, self.frames, self.simulator.fps)
 
-    def settle_noise(self, fit: Fit) -> None:
+    def settle_noise(self, fit: Fit, order: int = 2) -> None:
         """Does nothing: the noise is stated, or comes from third differences, which owe nothing to a fit."""
 
     def allow_slack(self, fit: Fit) -> int:
