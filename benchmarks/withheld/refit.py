@@ -280,10 +280,12 @@ def best(refit: Refit, rng: np.random.Generator, enough: float = 0.0, draws: int
     for _ in range(draws):
         done = done or along(rng.normal(size=len(zero)), ANNEALED)
     done = done or from_best(0, FINE)
-    idle, hops = 0, itertools.cycle(HOPS)
-    while not done and idle < IDLE:
+    idle = 0
+    for hop in itertools.cycle(HOPS):
+        if done or idle == IDLE:
+            break
         lowest = least(ends).cost
-        done = from_best(next(hops), Leg().step)
+        done = from_best(hop, Leg().step)
         idle = 0 if least(ends).cost < WORTH * lowest else idle + 1
     if not done:
         from_best(0, FINE)

@@ -16,6 +16,7 @@ from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting, batch_with_effects
 from mjx_refine.effects.mask_bias import inner
+from mjx_refine.effects.shape import worn
 from mjx_refine.evaluate import evaluate_scene
 from mjx_refine.scene import Body, Camera, Effect, Samples, Scene
 from mjx_refine.search import Options, refine
@@ -324,6 +325,49 @@ def test_a_shape_turns_with_its_body():
     assert (one != np.rot90(other)).mean() < 0.002
 
 
+@pytest.mark.parametrize("shape", ["box", "cylinder"])
+def test_worn_and_tapered_solids_reach_as_far_as_their_points(shape):
+    size, radius, taper = np.array([[0.5, 0.4 if shape == "box" else 0.7, 0.7 if shape == "box" else 0.0]]), 0.1, 0.3
+    half = size[0, 2] if shape == "box" else size[0, 1]
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(1, 1, 200, 3))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    # Corners (or rims) of the solid that a ball of this radius rolls around, and the ball.
+    turn = np.linspace(0, 2 * np.pi, 720, endpoint=False)
+    ring = np.stack([np.cos(turn), np.sin(turn)], -1)
+    square = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
+    ends = []
+    for sign in (1, -1):
+        across = square * (size[0, :2] - radius) if shape == "box" else ring * (size[0, 0] - radius)
+        ends.append(np.c_[across, np.full(len(across), sign * (half - radius))])
+    worn_points = np.concatenate(ends)
+    zero = np.zeros((1, 1, 1))
+
+    def reach(points):
+        return (normal[0, 0] @ points.T).max(-1)
+
+    sharp = np.concatenate(
+        [
+            np.c_[
+                square * size[0, :2] if shape == "box" else ring * size[0, 0], np.full(4 if shape == "box" else 720, z)
+            ]
+            for z in (half, -half)
+        ]
+    )
+    told = worn(shape, size, normal, zero + radius, zero)[0, 0]
+    np.testing.assert_allclose(reach(sharp) + told, reach(worn_points) + radius, atol=1e-4)
+    narrow = sharp * np.where(sharp[:, 2:] > 0, [1 - taper, 1 - taper, 1], [1 + taper, 1 + taper, 1])
+    told = worn(shape, size, normal, zero, zero + taper)[0, 0]
+    np.testing.assert_allclose(reach(sharp) + told, reach(narrow), atol=1e-4)
+
+
+def test_a_sphere_has_no_edges():
+    normal = np.array([[[[0.0, 0.6, 0.8]]]])
+    assert not worn(
+        "sphere", np.array([[0.3, 0.0, 0.0]]), normal, np.full((1, 1, 1), 0.1), np.full((1, 1, 1), 0.2)
+    ).any()
+
+
 # What least squares compares --------------------------------------------------------------------------------------------
 
 DRAWN = (
@@ -333,6 +377,7 @@ DRAWN = (
     effect("rolling_shutter", readout=0.015),
     effect("mask_bias", width=3.0),
     effect("shape", "ball", bulge=[0.0, 0.0, 0.0, 0.06] + [0.0] * 17),
+    effect("shape", "crate", bulge=[0.0] * 21, taper=0.2),
 )
 
 

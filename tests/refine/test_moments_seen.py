@@ -127,6 +127,33 @@ def test_noise_settles_at_what_changes_from_frame_to_frame(size):
     np.testing.assert_allclose(told.moment_noise / noise.moments[0], size, rtol=0.5)
 
 
+def test_a_large_misfit_that_bends_little_is_no_noise():
+    measured, counts, rng = _measured(), Counts(), np.random.default_rng(1)
+    misfit = 8.0 * np.arange(12)[:, None, None]
+    residual = Parts(*(rng.normal(size=part.shape) for part in measured.parts))
+    residual = residual._replace(moments=residual.moments + misfit)
+    noise = [settled(measured, residual, counts, order)[0].moment_noise / measured.moment_noise for order in (1, 2)]
+    np.testing.assert_allclose(noise[0], 3.0)  # as far as it may rise at once
+    np.testing.assert_allclose(noise[1], 1.0, rtol=0.5)
+
+
+def test_masks_that_another_comes_near_may_be_cut_by_it():
+    masks = np.zeros((10, 60, 80), np.uint8)
+    masks[:, 20:40, 10:30] = 1
+    masks[:, 20:40, 36:56] = 2
+    observation = Observation(np.zeros((9, 60, 80, 2), np.float32), masks, 30.0)
+    apart, near = measure(observation, (0, 1)), measure(observation, (0, 1), near=8)
+    assert np.isfinite(apart.reach).all()
+    # The right of the first and the left of the second.
+    assert np.isnan(near.reach[:, 0, 0]).all()
+    assert np.isnan(near.reach[:, 1, 8]).all()
+    assert np.isfinite(near.reach[:, 0, 8]).all()
+    assert np.isnan(near.moments).all()
+    narrower = apart.without_what_lacks(near)
+    assert narrower.count == near.count < apart.count
+    np.testing.assert_array_equal(narrower.edge_noise, apart.edge_noise)
+
+
 def test_masks_that_stand_still_say_little():
     clip = OwnClip(FLIGHT, 12)
     still = Observation(np.zeros_like(clip.flow), np.repeat(clip.masks[:1], 12, 0), 30.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 
 import numpy as np
@@ -138,6 +139,41 @@ def test_less_gravity_takes_up_part_of_a_drag(monkeypatch):
     assert found["shifts"]
     assert found["cost"] == pytest.approx(min(found["costs"]), abs=0.1)
     assert whole["px_left"] == pytest.approx(solve.displacement(alone, SHAKE, "picture"), abs=1e-3)
+
+
+def test_a_refit_is_carried_along_while_the_effect_grows():
+    slope = Effect("slope", None, {"x": 2.0, "y": 1.0})
+    with physics.engine() as opened:
+        model = refit.Refit(opened, Stage(scene(BALL), "flight"), (slope,))
+        zero, whole = np.zeros(len(model.base.numbers)), model.target
+        plain = model.seen(zero)
+        with model.partly(0.25):
+            np.testing.assert_allclose(model.target.reach, 0.75 * plain.reach + 0.25 * whole.reach, atol=1e-9)
+            np.testing.assert_allclose(model.target.flow, 0.75 * plain.flow + 0.25 * whole.flow, atol=1e-9)
+        assert model.target is whole
+
+
+def test_a_search_goes_on_as_long_as_it_leads_lower(monkeypatch):
+    monkeypatch.setattr(refit, "HOPS", (0.5,))
+    lowering = iter([80.0, 60.0, 59.0, 58.0, 57.0, 56.0])
+
+    class Told:
+        base = type("Base", (), {"numbers": [0, 0]})
+
+        def descend(self, start, leg):
+            return start
+
+        def partly(self, part):
+            return contextlib.nullcontext()
+
+        def ended(self, shifts):
+            # Starts beside the best end are those that are not at it.
+            return refit.Fit(shifts, next(lowering) if shifts.any() else 100.0, 9.0, 9.0)
+
+    end, costs = refit.best(Told(), np.random.default_rng(0), draws=0)  # type: ignore[arg-type]
+    # The last is the best end with finer steps; three that were hardly lower have ended the search.
+    assert end.cost == 56.0
+    assert len([cost for cost in costs if cost < 100]) == 6
 
 
 def test_least_is_asked_of_every_effect():
