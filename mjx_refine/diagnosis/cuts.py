@@ -54,27 +54,32 @@ def cut_places(masks: Int[np.ndarray, "frames height width"], most: int = 2) -> 
       masks: ids, 0: nothing.
       most: how many rectangles are told.
     """
-    seen = (masks > 0).any(0)
-    found: list[tuple[int, Box]] = []
-    for i in np.unique(masks[masks > 0]):
-        for axis in (0, 1):
-            for sign in (-1, 1):
-                # Seen so that the line is a row and the mask lies below it.
-                turned = masks if axis == 0 else masks.transpose(0, 2, 1)
-                turned = turned if sign < 0 else turned[:, ::-1]
-                told = _cut(turned, int(i))
-                if told is None:
-                    continue
-                frames, row, low, high, extent = told
-                empty = seen if axis == 0 else seen.T
-                empty = ~(empty if sign < 0 else empty[::-1])
-                top, low, high = _grown(empty, row, low, high, extent)
-                rows = (top, row) if sign < 0 else (turned.shape[1] - row, turned.shape[1] - top)
-                if row - top < DEEP:
-                    continue
-                box = Box(low, rows[0], high, rows[1]) if axis == 0 else Box(rows[0], low, rows[1], high)
-                found.append((frames, Box(*(float(v) for v in box))))
+    found = [
+        one
+        for i in np.unique(masks[masks > 0])
+        for axis in (1, 2)
+        for upwards in (False, True)
+        if (one := _hiding(masks, int(i), axis, upwards)) is not None
+    ]
     return tuple(box for _, box in sorted(found, key=lambda one: -one[0])[:most])
+
+
+def _hiding(masks: Int[np.ndarray, "frames height width"], i: int, axis: int, upwards: bool) -> tuple[int, Box] | None:
+    """(frames, rectangle) beyond one side of a mask along an axis of ``masks``, or None where that side is cut nowhere."""
+    # Seen so that the border is a row and the mask lies below it.
+    turned = masks if axis == 1 else masks.transpose(0, 2, 1)
+    turned = turned[:, ::-1] if upwards else turned
+    told = _cut(turned, i)
+    if told is None:
+        return None
+    frames, row, low, high, extent = told
+    top, low, high = _grown(np.asarray(turned.max(0) == 0), row, low, high, extent)
+    if row - top < DEEP:
+        return None
+    height = turned.shape[1]
+    first, last = (height - row, height - top) if upwards else (top, row)
+    box = (low, first, high, last) if axis == 1 else (first, low, last, high)
+    return frames, Box(*(float(v) for v in box))
 
 
 def _cut(masks: Int[np.ndarray, "frames height width"], i: int) -> tuple[int, int, int, int, int] | None:

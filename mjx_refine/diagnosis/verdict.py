@@ -110,8 +110,8 @@ NAMED = 30.0
 """Lead from which something is said to be missing: what two engines differ by stays below it."""
 
 QUIET, QUIETLY_NAMED = 1.35, 100.0
-"""Structure of the base model's residuals below which they look like noise, and the lead that is then asked for: without any effect
-a box that tumbled onto its corner led by 84 for a slope."""
+"""Structure of the base model's residuals below which they look like noise, and the lead that is then asked for: where a box
+tumbled onto its corner without any effect, a slope led by 84."""
 
 ODD, RESTLESS = 3.0, 2.5
 """Structure of the residuals, and their mean square, from which something is missing though no effect leads enough to be
@@ -130,8 +130,8 @@ FAR_OFF = 2.0
 
 PAIRED, PART_PAIRED = 100.0, 0.15
 """Lead of two effects over the best one, and its part of that one's lead, from which both are named: a first effect that is not
-quite right leaves the more the larger it is. Of twos with less of a lead, down to 50, none of six was right on seeds 10 and 23; of
-those with more, ten of twelve."""
+quite right leaves the more the larger it is. Of twos with less of a lead, down to 50, none of six was right on seeds 10 and
+23; of those with more, ten of twelve."""
 
 LESS, PART_LESS = 40.0, 0.01
 """The same where what the first leaves is not noise and the second clears it up, or where one of them moves the camera: what two
