@@ -26,7 +26,7 @@ SECOND_PROMISE = 8.0
 PROMISE_OF_PAIRS, FIRSTS = 15.0, 2
 """Lead that an effect needs for a second one to be looked for beside it, and beside how many causes that is done."""
 
-JOINED, TOGETHER = 5, 4
+JOINED, TOGETHER = 5, 3
 """Of how many of the best effects twos are put together, and how many twos, those whose leads add up to the most: what each
 found alone is a better place to begin than a linear look from a fit that has bent to the other effect."""
 
@@ -142,10 +142,11 @@ def _together(
     for one, other in sorted(twos, key=lambda two: -two[0].lead - two[1].lead)[:TOGETHER]:
         hypothesis = one.fit.hypothesis.added(other.fit.hypothesis.terms[-1])
         first, second = one.fit.z, other.fit.z
-        grounds = [first[:count], second[:count], first[:count] + second[:count] - base.z]
         parts = [(a * first[count:], b * second[count:]) for a, b in PARTS]
-        points = np.array([np.concatenate([z, *two]) for z in grounds for two in parts])
-        yield hypothesis, clip.best_of(hypothesis, points), one, other
+        # Not only where it costs least: from the better one's ordinary numbers fits end well that begin badly.
+        for grounds in ([first[:count]], [second[:count], first[:count] + second[:count] - base.z]):
+            points = np.array([np.concatenate([z, *two]) for z in grounds for two in parts])
+            yield hypothesis, clip.best_of(hypothesis, points), one, other
 
 
 def _walled(
