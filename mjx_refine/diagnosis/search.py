@@ -156,7 +156,8 @@ def _as_found_together(
 ) -> tuple[Candidate, ...]:
     """The single effects; where the best two found better ordinary numbers for one of them, with these."""
     rows = [(pair.fit, k) for pair in pairs[:TOGETHER] if pair.lead > singles[0].lead for k in range(len(pair.names))]
-    found = {(one.names, one.targets): one for one in singles}
+    plain = [dataclasses.replace(one, lead=lead_of(one.fit, base)) for one in singles]
+    found = {(one.names, one.targets): one for one in plain}
     for fit in clip.crew.each(clip, alone, rows):
         one = Candidate(fit, lead_of(fit, base), 0.0)
         old = found.get((one.names, one.targets))

@@ -12,10 +12,11 @@ from test_diagnosis import FLIGHT
 
 from mjx_refine.diagnosis import candidates
 from mjx_refine.diagnosis.base import base_space
-from mjx_refine.diagnosis.candidates import AGAINST, DOUBT, LEAST_UNIT, Candidate, in_order, lead_of
+from mjx_refine.diagnosis.candidates import AGAINST, AT_IMPACT, DOUBT, LEAST_UNIT, Candidate, in_order, lead_of
 from mjx_refine.diagnosis.fitted import Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.walls import push_last
+from mjx_refine.sim.c import MujocoSimulator
 
 MISFIT = 0.8
 PRICE = AGAINST * MISFIT
@@ -26,6 +27,8 @@ def _short_hits(request, monkeypatch):
     """Obstacles are hit and left, but where a test is about that."""
     if "leant" not in request.node.name:
         monkeypatch.setattr(candidates, "_leans", lambda clip, fit: False)
+    if "impact" not in request.node.name:
+        monkeypatch.setattr(candidates, "_bounces", lambda clip, fit: False)
 
 
 def candidate(lead: float, *terms: tuple[str, int]) -> Candidate:
@@ -87,6 +90,21 @@ def test_an_obstacle_that_is_leant_on_is_none(share, kept):
     clip: Any = SimpleNamespace(misfit=lambda fit: MISFIT, poses=lambda hypothesis, z: poses[None])
     one = Candidate(fit, 50.0, 0.0)
     assert in_order(clip, [one]) == ((one,) if kept else ())
+
+
+@pytest.mark.parametrize(("late", "less"), [(0.0, AT_IMPACT), (0.2, 0.0)])
+def test_a_push_at_an_impact_leads_by_less(late, less):
+    simulator = MujocoSimulator(FLIGHT.shapes, 30.0, 1)
+    space = base_space(FLIGHT)
+    plain = space.decode(space.start[None])
+    height = simulator.rollout(plain, 30)[0, :, 0, 2]
+    time = float(height.argmin()) / 30.0 + late
+    hypothesis = Hypothesis(space, (term("push", 0, 30, np.array([time, 0.3, 0.0, 0.0])),))
+    z = np.zeros(hypothesis.dimension)
+    fit = Fit(hypothesis, z, 1.0, 1.0, np.zeros((1, len(z))), np.zeros(1), 0.0)
+    clip: Any = SimpleNamespace(misfit=lambda fit: MISFIT, simulator=simulator, rollout=simulator.rollout, frames=30)
+    told = in_order(clip, [Candidate(fit, 500.0, 0.0)])
+    assert told[0].lead == pytest.approx(500.0 - less * MISFIT)
 
 
 def test_a_patch_leads_by_less_than_its_evidence():
