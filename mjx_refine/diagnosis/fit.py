@@ -307,10 +307,8 @@ class ClipFit:
         rival: float = np.inf,
         attempts: int | None = None,
     ) -> Fit:
-        """Levenberg-Marquardt from ``z``.
-
-        Given up where it stays far behind ``rival``, another hypothesis' cost; interrupted after so many ``attempts``.
-        """
+        """Levenberg-Marquardt from ``z``, given up where it stays far behind ``rival``, another hypothesis' cost; interrupted
+        after so many ``attempts``."""
         return self._descended(hypothesis, np.clip(z, *hypothesis.bounds), iterations, keep, scale, rival, attempts)
 
     @remembered
@@ -362,13 +360,8 @@ class ClipFit:
 
     @remembered
     def roam(self, fit: Fit, seed: int, widths: tuple[float, ...] = ROAMED) -> Fit:
-        """Least squares again from where an evolution strategy ends that begins at a fit, in its posterior's coordinates.
-
-        Args:
-          fit: where to begin.
-          seed: of the draws.
-          widths: of the first generation in each round [posterior standard deviations].
-        """
+        """Least squares again from where an evolution strategy ends that begins at a fit, in its posterior's coordinates;
+        ``widths``: of the first generation in each round [posterior standard deviations]."""
         for width in widths:
             factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
             low, high = fit.hypothesis.bounds
