@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from scipy import ndimage
 
 from mjx_refine.observation import Observation
-from mjx_refine.search.features import NEAR, flow_points, outlines
-from mjx_refine.view.moments import whole_masks
+from mjx_refine.search.features import flow_points, outlines
+from mjx_refine.view.moments import BESIDE, whole_masks
 from mjx_refine.view.tiles import foreground
 
 GRID = (6, 4)
@@ -117,7 +117,7 @@ class Measured:
         return Parts(*(piece.reshape(part.shape) for piece, part in zip(pieces, self.parts, strict=True)))
 
 
-def measure(observation: Observation, columns: tuple[int, ...], near: int = NEAR) -> Measured:
+def measure(observation: Observation, columns: tuple[int, ...], near: int = BESIDE) -> Measured:
     """Measures a clip.
 
     Args:

@@ -24,7 +24,7 @@ from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene
-from mjx_refine.search.features import NEAR
+from mjx_refine.view.moments import BESIDE
 
 FAMILIES = 7
 """Families (effect and target) that are fitted in full, the most promising first."""
@@ -268,7 +268,7 @@ def _may_be_cut(clip: ClipFit, observation: Observation, masks_of: tuple[int, ..
         return clip.measured
     ids = [int(i) for i in np.unique(observation.masks) if i != 0]
     columns = tuple(ids.index(i) if i in ids else -1 for i in masks_of)
-    return measure(observation, columns, NEAR + math.ceil(2 * thin))
+    return measure(observation, columns, BESIDE + math.ceil(2 * thin))
 
 
 def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:

@@ -8,13 +8,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
 
+from mjx_refine.view.moments import BESIDE
 from mjx_refine.view.outline import directions
 
 DIRECTIONS = 16
 MIN_PIXELS = 12
-NEAR = 2
-"""How near to the border or to another mask an outline may be cut by it [px]."""
-
 LEADING = 10
 PART = 0.28
 """The gap to the outline, in distances between the first and the tenth pixel centre."""
@@ -38,7 +36,7 @@ class Outlines:
     area: Float[np.ndarray, "frames masks"]
 
 
-def outlines(masks: Int[np.ndarray, "frames height width"], count: int = DIRECTIONS, near: int = NEAR) -> Outlines:
+def outlines(masks: Int[np.ndarray, "frames height width"], count: int = DIRECTIONS, near: int = BESIDE) -> Outlines:
     """Measures every mask in every frame; what another mask comes within ``near`` pixels of, it may cut."""
     ids = [int(i) for i in np.unique(masks) if i != 0]
     length = len(masks)
@@ -73,7 +71,7 @@ def _measure(frame: np.ndarray, i: int, normals: np.ndarray, near: int):
     reach = along.max(0) + _beyond(along, normals)
     others = ndimage.maximum_filter(np.where(mask, 0, part), size=2 * near + 1)[rows[extreme], columns[extreme]] > 0
     rows, columns = rows[extreme] + top, columns[extreme] + left
-    cut = (rows < NEAR) | (columns < NEAR) | (rows >= height - NEAR) | (columns >= width - NEAR) | others
+    cut = (rows < BESIDE) | (columns < BESIDE) | (rows >= height - BESIDE) | (columns >= width - BESIDE) | others
     return area, centre, np.where(cut, np.nan, reach)
 
 

@@ -23,6 +23,9 @@ FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
 
+BESIDE = 2
+"""How near to the border or to another mask an outline may be cut by it [px]."""
+
 LEAST_AREA = 1e-6
 """Area [px^2] below which a silhouette has no centroid of its own."""
 
@@ -176,7 +179,7 @@ def moments(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]) -
 
 
 def mask_moments(
-    masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...], least: int = 12, near: int = 2
+    masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...], least: int = 12, near: int = BESIDE
 ) -> Moments:
     """Moments of observed masks, (frames, ids), float64; NaN where they cannot be the whole silhouette's.
 
@@ -203,7 +206,7 @@ def mask_moments(
 
 
 def whole_masks(
-    masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...], near: int = 2
+    masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...], near: int = BESIDE
 ) -> Float[np.ndarray, "frames ids 3"]:
     """Centroid and equivalent radius, that of a disc as large, of masks that are seen whole [px]; NaN elsewhere."""
     found = mask_moments(masks, ids, near=near)
