@@ -9,7 +9,8 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+import scipy.special
+from jaxtyping import Float, Int
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.diagnosis.measure import Parts
@@ -24,6 +25,10 @@ from mjx_refine.view.seen import MANY, changed_moments, directions_for, outline_
 
 SIZES = (8, 48)
 """Batch sizes that are compiled: a line search, and the derivatives of two objects with an effect. More are cut up."""
+
+
+EDGE = 0.5
+"""Over what distance from an outline flow becomes that of what lies beside it [px]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +119,28 @@ class Predictor:
             reach = (reach + change)[..., :: count // DIRECTIONS]
             whole = changed_moments(whole, batch, view, change)
             flow = self._seen_flow(flow, batch, focal)
-        return Prediction(reach, flow, whole, self._background(batch, len(poses), poses.shape[1]), bad)
+        background = self._background(batch, len(poses), poses.shape[1])
+        wide = acting.overdrawn(batch)
+        if wide is not None and (wide > 0).any():
+            beside = self._beside(told[0], directions(count)) * np.minimum(wide, 1.0)[:, None, None, None]
+            around = background[:, np.arange(flow.shape[1])[:, None, None], self._nearest]
+            flow = flow + beside[..., None] * (around - flow)
+        return Prediction(reach, flow, whole, background, bad)
+
+    @functools.cached_property
+    def _nearest(self) -> Int[np.ndarray, "intervals objects points"]:
+        """The place beside the objects that is nearest to each of their points."""
+        away = self.pixels[:-1, :, :, None] - self.places
+        return np.square(away).sum(-1).argmin(-1)
+
+    def _beside(
+        self, reach: Float[np.ndarray, "batch frames objects directions"], normals: Float[np.ndarray, "directions 2"]
+    ) -> Float[np.ndarray, "batch intervals objects points"]:
+        """Whether points of the objects' masks lie beside their silhouettes, from 0 to 1."""
+        across = self.pixels[:-1] @ normals.T
+        # The silhouette is convex: what lies beyond the tangent in any direction is not of it.
+        beyond = np.stack([(across - row[:-1, :, None]).max(-1) for row in reach])
+        return scipy.special.expit(beyond / EDGE)
 
     def _predicted(self, seen: np.ndarray, batch: SceneBatch, count: int):
         """``_predict`` of rows by batches of ``SIZES``."""

@@ -16,6 +16,7 @@ from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import beginning, chosen_of
 from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.pairs import Told, pairs_of
+from mjx_refine.diagnosis.patches import patches_from_pushes
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.diagnosis.shown import view_of
@@ -28,6 +29,9 @@ from mjx_refine.view.moments import BESIDE
 
 FAMILIES = 7
 """Families (effect and target) that are fitted in full, the most promising first."""
+
+FROM_BEST = 5
+"""Ditto from where the best of them found the ordinary numbers."""
 
 FRESH = 6
 """Ditto that are fitted from the given scene as well."""
@@ -130,8 +134,7 @@ def _singles(
         least = min([base.cost, *(fit.cost for fit, _ in fitted.values())])
         for (_, lead), fit in zip(rows, _fit_leads(clip, rows, base.cost, least, told, lines), strict=True):
             _keep(fitted, (lead.name, lead.target), fit, lead.gain)
-        if "hidden_obstacle" in names:
-            _walls_from_pushes(clip, base, fitted, walled, view, told)
+        _in_place_of_pushes(clip, base, fitted, walled, view, names, told)
         best = max((fit for fit, _ in fitted.values()), key=lambda fit: fit.evidence, default=base)
         # What an effect's fit found for the base parameters may serve the base model as well.
         if best is tried or not fitted:
@@ -140,6 +143,7 @@ def _singles(
         if other.cost > base.cost - 1.0:
             break
         base = other
+    _from_the_best(clip, base, fitted, names, observation, masks_of, told, scene)
     base, fitted = exchanged(clip, base, fitted)
     first = sorted(fitted, key=lambda key: -fitted[key][0].evidence)[:ROAMING]
     first = [key for key in first if lead_of(fitted[key][0], base) > HOPELESS]
@@ -149,6 +153,26 @@ def _singles(
     fitted = at_least_nothing(clip, base, fitted)
     finals = [Candidate(fit, lead_of(fit, base), promise) for fit, promise in fitted.values()]
     return base, in_order(clip, finals)
+
+
+def _from_the_best(
+    clip: ClipFit, base: Fit, fitted: Fitted, names, observation, masks_of, told: Told, scene: Scene
+) -> None:
+    """Fits effects from where the best one's ordinary numbers are, with that effect gone: the base model's are bent towards
+    it, and the best one's are not, whatever its name."""
+    best = max(fitted, key=lambda key: fitted[key][0].evidence, default=None)
+    if best is None or lead_of(fitted[best][0], base) < CLEAR:
+        return
+    told("looking ahead from the best effect's numbers")
+    z = fitted[best][0].z[: base.hypothesis.dimension]
+    ground = clip.at(base.hypothesis, z, scale=FORGIVING)
+    leads = Screen(clip, ground, view_of(clip, ground, observation, masks_of), FORGIVING).leads(names)
+    leads = [lead for lead in leads if (lead.name, lead.target) != best]
+    rows = [(ground, lead) for lead in chosen_of(leads, FROM_BEST, 1)]
+    lines = [f"{lead.name} {target_name(scene.names, lead.target)}".strip() for _, lead in rows]
+    least = min(fit.cost for fit, _ in fitted.values())
+    for (_, lead), fit in zip(rows, _fit_leads(clip, rows, base.cost, least, told, lines, True), strict=True):
+        _keep(fitted, (lead.name, lead.target), fit, lead.gain)
 
 
 def _as_found_together(
@@ -177,7 +201,13 @@ def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
 
 
 def _fit_leads(
-    clip: ClipFit, rows: list[tuple[Fit, Lead]], rival: float, least: float, told: Told, lines: list[str]
+    clip: ClipFit,
+    rows: list[tuple[Fit, Lead]],
+    rival: float,
+    least: float,
+    told: Told,
+    lines: list[str],
+    far: bool = False,
 ) -> list[Fit]:
     """Fits leads from where they were seen, to the end where they may become the best.
 
@@ -189,7 +219,7 @@ def _fit_leads(
       told: called with the line of a fit that is looked at.
       lines: one a lead.
     """
-    fits = clip.crew.each(clip, _begun, [(*row, rival) for row in rows], told, lines)
+    fits = clip.crew.each(clip, _begun, [(*row, rival, far) for row in rows], told, lines)
     least = min([least, *(fit.cost for fit in fits)])
     bound = least + max(CLOSE, SOME_OF_IT * (rival - least))
     near = [k for k, fit in enumerate(fits) if fit.cost < bound * (MAY_ERR if _strikes(fit) else 1.0)]
@@ -202,15 +232,15 @@ def _strikes(fit: Fit) -> bool:
     return any(t.kind.strikes for t in fit.hypothesis.terms)
 
 
-def _begun(clip: ClipFit, here: Fit, lead: Lead, rival: float) -> Fit:
-    """A lead's fit after its first steps."""
+def _begun(clip: ClipFit, here: Fit, lead: Lead, rival: float, far: bool = False) -> Fit:
+    """A lead's fit after its first steps; ``far``: from where the base model does not fit."""
     one = lead.term(clip.frames)
     hypothesis = here.hypothesis.added(one)
     z = beginning(clip, hypothesis, here, lead, lead.z(one))
-    if not here.z.any():
+    if far or not here.z.any():
         z = clip.fit(hypothesis, z, 7, scale=FORGIVING).z
     fit = clip.fit(hypothesis, z, 9, rival=rival, attempts=LOOK)
-    if fit.cost > here.cost and here.z.any() and not lead.whole:
+    if fit.cost > here.cost and here.z.any() and not lead.whole and not far:
         # Where the linear look misleads, the effect grows from nothing.
         fit = clip.fit(hypothesis, np.concatenate([here.z, 0 * lead.z(one)]), 9, rival=rival, attempts=LOOK)
     return fit
@@ -221,16 +251,25 @@ def _ended(clip: ClipFit, fit: Fit, rival: float) -> Fit:
     return knocked(clip, fit if fit.ended else clip.gone_on(fit, REST, rival), rival)
 
 
-def _walls_from_pushes(clip: ClipFit, base: Fit, fitted: Fitted, walled: list[Fit], view: FitView, told: Told) -> None:
-    """An obstacle begins where a push was found; ``walled`` are those pushes for which that was done before."""
+def _in_place_of_pushes(
+    clip: ClipFit, base: Fit, fitted: Fitted, asked: list[Fit], view: FitView, names: list[str], told: Told
+) -> None:
+    """An obstacle, and a patch, begin where a push was found; ``asked`` are those pushes for which that was done before."""
     pushes = [(target, *found) for (name, target), found in fitted.items() if name == "push"]
-    pushes = [row for row in pushes if row[1].evidence >= base.evidence + 3.0 and not any(row[1] is w for w in walled)]
-    walled += [fit for _, fit, _ in pushes]
-    rows = [(fit, view, base.cost) for _, fit, _ in pushes]
-    walls = walls_from_pushes(clip, rows, told, ["hidden_obstacle"] * len(pushes))
-    for (target, _, promise), wall in zip(pushes, walls, strict=True):
-        if wall is not None:
-            _keep(fitted, ("hidden_obstacle", target), wall, promise)
+    pushes = [row for row in pushes if row[1].evidence >= base.evidence + 3.0 and not any(row[1] is w for w in asked)]
+    asked += [fit for _, fit, _ in pushes]
+    if "hidden_obstacle" in names:
+        rows = [(fit, view, base.cost) for _, fit, _ in pushes]
+        walls = walls_from_pushes(clip, rows, told, ["hidden_obstacle"] * len(pushes))
+        for (target, _, promise), wall in zip(pushes, walls, strict=True):
+            if wall is not None:
+                _keep(fitted, ("hidden_obstacle", target), wall, promise)
+    if "friction_patch" in names:
+        for (_, _, promise), patch in zip(
+            pushes, patches_from_pushes(clip, [(f, view) for _, f, _ in pushes]), strict=True
+        ):
+            if patch is not None:
+                _keep(fitted, ("friction_patch", -1), patch, promise)
 
 
 def _again(
@@ -245,7 +284,7 @@ def _again(
         if np.all(clip.measured.moment_noise > SETTLED * taken):
             break
     clip.allow_chaos(best, seed)
-    impacts = clip.allow_slack(base)
+    impacts = clip.allow_slack(best)
     rows = [(base, 10), *((one.fit, 8) for one in singles[:KEPT])]
     base, *fits = clip.crew.each(clip, _refitted, rows)
     found = [

@@ -250,6 +250,13 @@ def outline_change(batch: SceneBatch, view: OutlineView) -> Float[np.ndarray, "b
     return total
 
 
+def overdrawn(batch: SceneBatch) -> Float[np.ndarray, "batch"] | None:
+    """How far masks show what lies beside the objects [px], or None where no effect says so."""
+    found = [kind.overdrawn(effect.values) for kind, effect in _acting(batch)]
+    told = [one for one in found if one is not None]
+    return sum(told[1:], told[0]) if told else None
+
+
 def hidden_polygons(
     batch: SceneBatch, outline: Float[np.ndarray, "batch frames objects corners 2"]
 ) -> Float[np.ndarray, "batch frames objects others 2"] | None:

@@ -6,6 +6,9 @@ import numpy as np
 
 from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Motion, Start, glance, rim_speed
 
+CROSSED = (0, 1, 2, 4, 8)
+"""How many frames late an object may be at the middle of a patch, and how many it may take from there to the border."""
+
 
 class FrictionPatch(EffectKind):
     """Sliding friction with the floor is ``friction`` while the object's centre is above a disc."""
@@ -49,6 +52,25 @@ class FrictionPatch(EffectKind):
                         found.append(np.array([*centre, wide * radius, friction]))
         width = [np.array([0.5 * v[2], 0.5 * v[2], 0.4 * v[2], 0.4]) for v in found]
         return [Start(v, width=w, places=max(len(found), 1)) for v, w in zip(found, width, strict=True)]
+
+    def crossed(self, view: FitView, target: int, frame: int) -> list[Start]:
+        """Patches that an object crosses about ``frame``; none where it is not on the floor then."""
+        near = slice(max(frame - 1, 0), frame + 2)
+        if not view.on_floor[near, target].any():
+            return []
+        path, own = view.poses[:, target, :2], float(view.batch.friction[0, target, 0])
+        pace = float(np.linalg.norm(np.diff(path[max(frame - 3, 0) : frame + 4], axis=0), axis=1).mean())
+        found = [
+            np.array([*path[int(np.clip(frame + late, 0, len(path) - 1))], np.clip(wide * pace, 0.03, 2.0), friction])
+            for late in CROSSED
+            for wide in CROSSED
+            if wide > 0
+            for friction in (0.25 * own, own + 0.3, own + 0.8)
+        ]
+        width = [np.array([0.5 * v[2], 0.5 * v[2], 0.4 * v[2], 0.4]) for v in found]
+        return [
+            Start(v, width=w, places=len(self.starts(view, target)) or 1) for v, w in zip(found, width, strict=True)
+        ]
 
     def window(self, view: FitView, target: int, values: np.ndarray) -> tuple[int, int] | None:
         inside = self._inside(view, values)[:, self.struck(view, values)]

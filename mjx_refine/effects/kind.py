@@ -238,6 +238,10 @@ class EffectKind:
         """The part of convex polygons (batch, frames, objects, corners, 2) [px] that is not seen, as polygons, or None."""
         return None
 
+    def overdrawn(self, values: np.ndarray) -> np.ndarray | None:
+        """How far masks show what lies beside the objects, (batch,) [px], or None."""
+        return None
+
     def warp(self, points: np.ndarray, focal: np.ndarray, image: tuple[int, int], values: np.ndarray):
         """How far points of the undistorted picture (batch, ..., 2) [px] are moved [px], or None."""
         return None

@@ -30,6 +30,9 @@ class MaskBias(EffectKind):
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         return width_change(view.reach, values[:, 0])
 
+    def overdrawn(self, values: np.ndarray) -> np.ndarray | None:
+        return np.maximum(values[:, 0], 0.0)
+
     def shrinks(self, values: np.ndarray) -> bool:
         return bool((values[:, 0] < 0).any())
 

@@ -1,0 +1,57 @@
+"""A patch of the floor in the place of a push: what changes a sliding body's velocity may be what it slides on."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.screen import term_of
+from mjx_refine.effects.friction_patch import FrictionPatch
+from mjx_refine.effects.kind import FitView
+
+BEGUN, LOOK, ITERATIONS = 4, 5, 12
+"""From how many of the patches fits begin, after how many steps the best of these goes on, and for how long."""
+
+
+def patches_from_pushes(clip: ClipFit, pushes: Sequence[tuple[Fit, FitView]]) -> list[Fit | None]:
+    """For each fit, whose only effect is a push, the best with a patch that is crossed about then; None where its object is not
+    on the floor."""
+    begun = clip.crew.each(clip, _crossings, list(pushes))
+    fits = iter(clip.crew.each(clip, _begun, [row for rows in begun for row in rows]))
+    best = [max((next(fits) for _ in rows), key=lambda fit: fit.evidence, default=None) for rows in begun]
+    there = [fit for fit in best if fit is not None]
+    ended = iter(clip.crew.each(clip, _ended, [(fit,) for fit in there]))
+    return [None if fit is None else next(ended) for fit in best]
+
+
+def _crossings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis, np.ndarray]]:
+    (push,) = fit.hypothesis.terms
+    time = float(fit.hypothesis.values(fit.z[None], 0)[0, 0])
+    poses = clip.poses(fit.hypothesis, fit.z[None])[0]
+    if not np.isfinite(poses).all():
+        return []
+    frame = int(np.clip(round(time * view.fps), 0, clip.frames - 1))
+    starts = FrictionPatch().crossed(dataclasses.replace(view, poses=poses), push.target, frame)
+    if not starts:
+        return []
+    rest = dataclasses.replace(fit.hypothesis, terms=())
+    base = fit.z[: rest.dimension]
+    rows = []
+    for start in starts:
+        one = term_of("friction_patch", -1, start, clip.frames)
+        hypothesis = rest.added(one)
+        z = np.concatenate([base, 0 * one.centre[one.free]])
+        rows.append((float(clip.residuals(hypothesis, z[None])[1][0]), hypothesis, z))
+    return [(hypothesis, z) for _, hypothesis, z in sorted(rows, key=lambda row: row[0])[:BEGUN]]
+
+
+def _begun(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray) -> Fit:
+    return clip.fit(hypothesis, z, LOOK)
+
+
+def _ended(clip: ClipFit, fit: Fit) -> Fit:
+    return clip.fit(fit.hypothesis, fit.z, ITERATIONS)
