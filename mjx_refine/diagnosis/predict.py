@@ -78,6 +78,7 @@ class Predictor:
       places: points beside the objects at which the flow was measured [px].
       image: (width, height) [px].
       fps: frames a second.
+      blur: how far from an outline the flow beside it is still much like the object's [px].
     """
 
     def __init__(
@@ -87,8 +88,10 @@ class Predictor:
         places: Float[np.ndarray, "places 2"],
         image: tuple[int, int],
         fps: float,
+        blur: float = 0.0,
     ):
         self.shapes, self.pixels, self.places, self.image, self.fps = shapes, pixels, places, image, fps
+        self.blur = blur
 
     def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Prediction:
         """The prediction for ``poses`` (of ``Simulator.rollout``) seen with the camera and effects of ``batch``."""
@@ -140,7 +143,7 @@ class Predictor:
         across = self.pixels[:-1] @ normals.T
         # The silhouette is convex: what lies beyond the tangent in any direction is not of it.
         beyond = np.stack([(across - row[:-1, :, None]).max(-1) for row in reach])
-        return scipy.special.expit(beyond / EDGE)
+        return scipy.special.expit((beyond - self.blur) / EDGE)
 
     def _predicted(self, seen: np.ndarray, batch: SceneBatch, count: int):
         """``_predict`` of rows by batches of ``SIZES``."""

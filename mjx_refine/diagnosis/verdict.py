@@ -119,7 +119,8 @@ ODD, RESTLESS = 3.0, 2.5
 named: on eight clips without effect of the withheld exams that mean square was 0.4 to 1."""
 
 CLOSES = 0.1
-"""Part of the gap on frames that no fit has seen which what is named must close: else it merely bends with the frames seen."""
+"""Part of the gap on frames that no fit has seen which what is named must close: else it merely bends with the frames seen, and
+where it then leads by no more than is asked of what looks like noise, and leaves nothing that does not, nothing is missing."""
 
 STRANGE, CLEAR, STRANGEST = 1.3, 150.0, 3.2
 """Structure of the residuals above which the named effect is not what, or not all that, is missing; the margin over the next
@@ -210,7 +211,8 @@ def answer(told: Signs, leads: list[float], video: bool = False) -> Answer:
     weights = SHARPNESS * (np.array(leads) - max(leads)) / max(told.after, 0.3) if leads else np.zeros(0)
     shares = tuple(float(w) for w in np.exp(weights) / np.exp(weights).sum()) if leads else ()
     quiet, asked = QUIET_OF_A_VIDEO if video else QUIET
-    if told.lead < (NAMED if told.structure_before >= quiet else asked):
+    bends = video and told.closed < CLOSES and told.lead < asked and told.structure_after <= STRANGE
+    if bends or told.lead < (NAMED if told.structure_before >= quiet else asked):
         if told.structure_after > ODD or told.whole > RESTLESS:
             return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
         if told.held_out > UNSEEN:
