@@ -19,7 +19,7 @@ from mjx_refine.diagnosis.pace import STEPS, Standing, descended
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.roam import GENERATIONS, ROAMED, Strategy
 from mjx_refine.diagnosis.settled import Loose, Settled
-from mjx_refine.diagnosis.slack import PART, Impact, Slack, Slacks, impacts, kicked, sustained, too_wide, touching
+from mjx_refine.diagnosis.slack import PART, Impact, Slack, Slacks, contacts, kicked, too_wide
 from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
 from mjx_refine.scene import Shape
 from mjx_refine.search.residuals import slowed
@@ -113,15 +113,15 @@ class ClipFit:
         self.rollouts += float(more[0])
 
     def allow_slack(self, fit: Fit) -> int:
-        """Lets contacts of a base model's fit err, and masks be a little wide; returns how many impacts there are."""
+        """Lets contacts along a fit's path err, and masks be a little wide; returns how many impacts there are."""
         batch = fit.hypothesis.batch(fit.z[None])
         poses = self.poses(fit.hypothesis, fit.z[None])[0]
         self._loose, self._columns, self._slacks = None, None, Slacks()
         if not np.isfinite(poses).all():
             return 0
-        found = impacts(batch, poses, self.simulator.fps)
+        plain = self.poses(*fit.ordinary)[0] if fit.hypothesis.terms else None
+        found, long = contacts(batch, poses, plain, self.simulator.fps)
         sharp = self.noise
-        long = sustained(batch, poses, touching(batch, poses), self.simulator.fps)
         still = self.predictor(poses[None], batch)
         kicks = self.kicks(batch, poses, still, [*found, *long], PART) if found or long else None
         marks = [(i.target, i.frame) for i in found]

@@ -37,6 +37,12 @@ class Fit:
     ended: bool = True
 
     @property
+    def ordinary(self) -> tuple[Hypothesis, Float[np.ndarray, "1 dimension"]]:
+        """The hypothesis without its effects, and the point in it."""
+        plain = dataclasses.replace(self.hypothesis, terms=())
+        return plain, self.z[None, : plain.dimension]
+
+    @property
     def gradient(self) -> Float[np.ndarray, "dimension"]:
         """Of the cost."""
         price, slope = prior(self.hypothesis, self.z)

@@ -26,9 +26,9 @@ SECOND_PROMISE = 8.0
 PROMISE_OF_PAIRS, FIRSTS = 15.0, 2
 """Lead that an effect needs for a second one to be looked for beside it, and beside how many causes that is done."""
 
-JOINED, TOGETHER = 5, 3
-"""Of how many of the best effects twos are put together, and how many twos, those whose leads add up to the most: what each
-found alone is a better place to begin than a linear look from a fit that has bent to the other effect."""
+JOINED, LOOK, TOGETHER = 4, 4, 6
+"""Of how many of the best effects twos are put together, after how many steps their fits are compared, how many of these go on:
+what each found alone is a better place to begin than a linear look from a fit that has bent to the other effect."""
 
 PARTS = ((1.0, 1.0), (0.5, 0.5), (1.0, 0.3), (0.3, 1.0), (0.7, 0.7))
 """How much of each of two effects their common fit begins with: alone, each explains part of what is the other's."""
@@ -73,7 +73,9 @@ def pairs_of(
     together = list(_together(clip, base, singles)) if beside else []
     lines = [f"{first.names[0]} and {second.names[0]}, together" for _, _, first, second in together]
     rows = [(hypothesis, z, min(first.fit.cost, second.fit.cost)) for hypothesis, z, first, second in together]
-    fits = clip.crew.each(clip, _joined, rows, told, lines)
+    looks = clip.crew.each(clip, _looked, rows, told, lines)
+    near = sorted(range(len(rows)), key=lambda k: looks[k].cost)[:TOGETHER]
+    fits = clip.crew.each(clip, _joined, [(rows[k][0], looks[k].z, rows[k][2]) for k in near])
     found += [Candidate(fit, lead_of(fit, base), 0.0) for fit in fits]
     found = _gone_on(clip, base, found)
     if "hidden_obstacle" in names:
@@ -136,10 +138,10 @@ def _one_cause(one: Candidate, other: Candidate) -> bool:
 def _together(
     clip: ClipFit, base: Fit, singles: tuple[Candidate, ...]
 ) -> Iterator[tuple[Hypothesis, Float[np.ndarray, "dimension"], Candidate, Candidate]]:
-    """The most promising twos of the best effects, each as it was found alone, and where their fits begin."""
+    """Twos of the best effects, each as it was found alone, and where their fits begin."""
     count = base.hypothesis.dimension
     twos = [two for two in itertools.combinations(singles[:JOINED], 2) if not _one_cause(*two) and two[1].lead > 0]
-    for one, other in sorted(twos, key=lambda two: -two[0].lead - two[1].lead)[:TOGETHER]:
+    for one, other in twos:
         hypothesis = one.fit.hypothesis.added(other.fit.hypothesis.terms[-1])
         first, second = one.fit.z, other.fit.z
         parts = [(a * first[count:], b * second[count:]) for a, b in PARTS]
@@ -186,6 +188,10 @@ def _second(clip: ClipFit, first: Fit, lead: Lead) -> Fit:
     one = lead.term(clip.frames)
     hypothesis = first.hypothesis.added(one)
     return _joined(clip, hypothesis, beginning(clip, hypothesis, first, lead, lead.z(one)), first.cost)
+
+
+def _looked(clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimension"], rival: float) -> Fit:
+    return clip.fit(hypothesis, z, ITERATIONS, rival=rival, attempts=LOOK)
 
 
 def _joined(clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimension"], rival: float) -> Fit:

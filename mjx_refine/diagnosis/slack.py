@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch, concatenate
 from mjx_refine.diagnosis.measure import Measured, Parts
+from mjx_refine.effects import acting
 from mjx_refine.sim.backends import Simulator
 from mjx_refine.sim.model import SUBSTEPS
 from mjx_refine.space.layout import lowest_extent
@@ -40,6 +41,9 @@ PHASES, SHORTEST = 3, 6
 SLIDING, ROLLING = (0.35, 0.1), (1.0, 0.05)
 """How large the error of the change of velocity in each is against that of an impact, and the least part of the speed that
 is taken for a change: every engine has a law of its own for rolling friction."""
+
+PARTED = 1e-4
+"""Distance between the paths with an effect and without from which on it acts [m]."""
 
 REMEMBERED = 16
 """Decompositions of columns that are kept at a time."""
@@ -148,8 +152,50 @@ def impacts(batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], fps
     return found
 
 
+def contacts(
+    batch: SceneBatch,
+    poses: Float[np.ndarray, "frames objects 7"],
+    plain: Float[np.ndarray, "frames objects 7"] | None,
+    fps: float,
+) -> tuple[list[Impact], list[Impact]]:
+    """Impacts and times on the floor along a path; what effects themselves do is neither.
+
+    Args:
+      batch: whose path it is, with its effects.
+      poses: the path.
+      plain: the same without effects; None where there are none.
+      fps: frames a second.
+    """
+    on_floor = touching(batch, poses)
+    if plain is None:
+        return impacts(batch, poses, fps), sustained(batch, poses, on_floor, fps)
+    if not np.isfinite(plain).all():
+        return impacts(batch, poses, fps), []
+    return _not_own(impacts(batch, poses, fps), impacts(batch, plain, fps), poses, plain), sustained(
+        batch, plain, on_floor, fps
+    )
+
+
+def _not_own(found: list[Impact], plain: list[Impact], poses: np.ndarray, without: np.ndarray) -> list[Impact]:
+    """But for jumps that an effect itself makes where it first acts on an object: a push, something that is hit."""
+    apart = np.linalg.norm(poses[..., :3] - without[..., :3], axis=-1) > PARTED
+    first = [int(np.argmax(row)) if row.any() else -9 for row in apart.T]
+
+    def own(one: Impact) -> bool:
+        return one.frame - first[one.target] in (0, 1) and not any(
+            one.target == other.target and abs(one.frame - other.frame) <= 1 for other in plain
+        )
+
+    return [one for one in found if not own(one)]
+
+
 def touching(batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"]) -> Bool[np.ndarray, "frames objects"]:
-    """Which bodies of the first candidate touch the floor."""
+    """Which bodies of the first candidate touch the floor, level or not."""
+    turn = acting.floor_rotation(batch)
+    if turn is not None:
+        level = np.swapaxes(turn[0], -1, -2)
+        turned = rotations.multiply(acting.quaternion_of(level), poses[..., 3:])
+        poses = np.concatenate([poses[..., :3] @ level.T, turned], -1)
     lowest = [
         np.broadcast_to(lowest_extent(s, batch.size[0, n][None], poses[:, n, 3:]), len(poses))
         for n, s in enumerate(batch.shapes)
@@ -243,7 +289,9 @@ def states(simulator: Simulator, batch: SceneBatch, poses: np.ndarray) -> tuple[
 
 
 def _restarted(batch: SceneBatch, pose: np.ndarray, velocity: np.ndarray, spin: np.ndarray, count: int) -> SceneBatch:
-    many = batch.map(lambda a: np.repeat(a[:1], count, 0))
+    # Frames are counted from here on.
+    whole = dataclasses.replace(batch, effects=tuple(e for e in batch.effects if e.name != "dropped_frames"))
+    many = whole.map(lambda a: np.repeat(a[:1], count, 0))
     quaternion = np.repeat(pose[None, :, 3:], count, 0)
     return dataclasses.replace(
         many,

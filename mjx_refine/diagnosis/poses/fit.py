@@ -21,7 +21,7 @@ from mjx_refine.diagnosis.pace import STEPS
 from mjx_refine.diagnosis.poses.data import Poses, noise_of, rotation_vector
 from mjx_refine.diagnosis.predict import Prediction
 from mjx_refine.diagnosis.settled import Loose
-from mjx_refine.diagnosis.slack import PART, Impact, Slacks, impacts, sustained, touching
+from mjx_refine.diagnosis.slack import PART, Impact, Slacks, contacts
 from mjx_refine.diagnosis.store import fingerprint
 from mjx_refine.search.residuals import slowed
 from mjx_refine.sim.backends import Simulator
@@ -170,13 +170,14 @@ class PosesFit(ClipFit):
         """Does nothing: the noise is stated, or comes from third differences, which owe nothing to a fit."""
 
     def allow_slack(self, fit: Fit) -> int:
-        """Lets contacts of a base model's fit err from now on; returns how many impacts there are."""
+        """Lets contacts along a fit's path err from now on; returns how many impacts there are."""
         batch = fit.hypothesis.batch(fit.z[None])
         poses = self.poses(fit.hypothesis, fit.z[None])[0]
         self._loose, self._columns, self._slacks = None, None, Slacks()
         if not np.isfinite(poses).all():
             return 0
-        found, long = self._contacts(batch, poses)
+        plain = self.poses(*fit.ordinary)[0] if fit.hypothesis.terms else None
+        found, long = self._contacts(batch, poses, plain)
         sharp = self.noise
         still = self.predictor(poses[None], batch)
         kicks = self.kicks(batch, poses, still, [*found, *long], PART) if found or long else None
@@ -185,13 +186,15 @@ class PosesFit(ClipFit):
         self.set_slackness(self.slackness)
         return len(found)
 
-    def _contacts(self, batch: SceneBatch, poses: np.ndarray) -> tuple[list[Impact], list[Impact]]:
+    def _contacts(
+        self, batch: SceneBatch, poses: np.ndarray, plain: np.ndarray | None
+    ) -> tuple[list[Impact], list[Impact]]:
         """Impacts and times on the floor, looked for at a video's rate, which the constants were chosen at."""
         every = max(1, round(self.simulator.fps / VIDEO))
         coarse, rate = poses[::every], self.simulator.fps / every
         if len(coarse) < 3:
             return [], []
-        told = impacts(batch, coarse, rate), sustained(batch, coarse, touching(batch, coarse), rate)
+        told = contacts(batch, coarse, None if plain is None else plain[::every], rate)
         last = len(poses) - 2
         found, long = ([dataclasses.replace(i, frame=min(i.frame * every, last)) for i in part] for part in told)
         return found, long
