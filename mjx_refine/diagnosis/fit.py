@@ -29,9 +29,6 @@ from mjx_refine.sim.c import MujocoSimulator
 SCALE = 5.0
 """Noise widths beyond which residuals count ever less."""
 
-BLURRED = 2.0
-"""How far flow that was measured carries an object's motion beyond its outline [px]."""
-
 PATIENCE = Parts(1.0, 1.0, 6.0, 1.0)
 """The same for each kind of measurement, in multiples: a centroid is either of the whole mask or not measured at all."""
 
@@ -52,8 +49,8 @@ class ClipFit:
     ):
         self.simulator, self.measured, self.image, self.frames = simulator, measured, image, frames
         self.noise = noise or everywhere(measured, frames)
-        blur = 0.0 if measured.stated else BLURRED
-        self.predictor = Predictor(simulator.shapes, measured.pixels, measured.places, image, simulator.fps, blur)
+        places, blur = measured.places, measured.blur
+        self.predictor = Predictor(simulator.shapes, measured.pixels, places, image, simulator.fps, blur)
         self.rollouts = 0.0
         self.counts = Counts()
         self.store, self.crew = Store(), Crew()

@@ -33,6 +33,10 @@ FLOW_PART = 0.08
 """Error of measured flow that is smooth over an object, as a part of its motion; half where its noise is stated."""
 
 
+BLURRED = 2.0
+"""How far flow that was measured carries an object's motion beyond its outline [px]."""
+
+
 class Parts(NamedTuple):
     """One array for each kind of measurement, measured, predicted, or the difference.
 
@@ -94,6 +98,11 @@ class Measured:
             speed[:-1] = np.nanmedian(np.linalg.norm(self.flow, axis=-1), -1)
         speed[-1] = speed[-2] if len(speed) > 1 else np.nan
         return np.clip(np.nan_to_num(speed, nan=1.0) / FRESH, STALE, 1.0)
+
+    @property
+    def blur(self) -> float:
+        """How far from an outline the flow beside it is still much like the object's [px]."""
+        return 0.0 if self.stated else BLURRED
 
     @property
     def parts(self) -> Parts:

@@ -182,7 +182,7 @@ def _not_own(found: list[Impact], plain: list[Impact], poses: np.ndarray, withou
     first = [int(np.argmax(row)) if row.any() else -9 for row in apart.T]
 
     def own(one: Impact) -> bool:
-        return one.frame - first[one.target] in (0, 1) and not any(
+        return abs(one.frame - first[one.target]) <= 1 and not any(
             one.target == other.target and abs(one.frame - other.frame) <= 1 for other in plain
         )
 

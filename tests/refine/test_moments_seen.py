@@ -76,6 +76,27 @@ def test_centroids_and_areas_are_those_of_the_pictures(entry):
     assert off[..., 2].max() < 0.3
 
 
+def test_fat_masks_show_what_stands_still_beside_an_object():
+    plain = batch_with_effects([SCENE])
+    poses = MujocoSimulator(plain.shapes, FPS, 1).rollout(plain, 3)
+    x, y, radius = seen_moments(poses, plain)[0, 0, 0]
+    # In the ball's middle, then one and five pixels beside it.
+    pixels = np.zeros((3, 2, 3, 2))
+    pixels[:, 0] = [[x, y], [x - radius - 1.0, y], [x - radius - 5.0, y]]
+
+    def flow(width: float, blur: float = 0.0) -> np.ndarray:
+        batch = batch_with_effects([dataclasses.replace(SCENE, effects=(effect("mask_bias", width=width),))])
+        told = Predictor(batch.shapes, pixels, np.array([[20.0, 20.0]]), SIZE, FPS, blur)(poses, batch)
+        return np.linalg.norm(told.flow[0, 0, 0], axis=-1)
+
+    still, fat, smeared = flow(0.0), flow(6.0), flow(6.0, 2.0)
+    assert still.min() > 5.0
+    np.testing.assert_allclose(fat / still, [1.0, 0.0, 0.0], atol=0.2)
+    np.testing.assert_allclose(smeared / still, [1.0, 1.0, 0.0], atol=0.2)
+    # Thin masks show nothing but the object.
+    np.testing.assert_allclose(flow(-3.0), still)
+
+
 def test_an_occluder_moves_what_is_left_of_a_mask():
     plain = batch_with_effects([SCENE])
     poses = MujocoSimulator(plain.shapes, FPS, 1).rollout(plain, 2)
