@@ -23,8 +23,9 @@ from mjx_refine.effects.kind import FitView
 SECOND_PROMISE = 8.0
 """Evidence that the linear look must promise for a second effect to be fitted beside the first."""
 
-PROMISE_OF_PAIRS, FIRSTS = 15.0, 2
-"""Lead that an effect needs for a second one to be looked for beside it, and beside how many causes that is done."""
+PROMISE_OF_PAIRS, FIRSTS, SECONDS = 15.0, 2, 5
+"""Lead that an effect needs for a second one to be looked for beside it, beside how many causes that is done, and how many second
+effects are looked at beside each."""
 
 JOINED, LOOK, TOGETHER = 4, 4, 6
 """Of how many of the best effects twos are put together, after how many steps their fits are compared, how many of these go on:
@@ -68,8 +69,11 @@ def pairs_of(
     """
     beside = list(_beside(clip, singles, names, shown))
     lines = [f"{first.names[0]} and {lead.name}" for first, lead in beside]
-    fits = clip.crew.each(clip, _second, [(first.fit, lead) for first, lead in beside], told, lines)
-    found = [Candidate(fit, lead_of(fit, base), lead.gain) for fit, (_, lead) in zip(fits, beside, strict=True)]
+    looks = clip.crew.each(clip, _second, [(first.fit, lead) for first, lead in beside], told, lines)
+    near = sorted(range(len(looks)), key=lambda k: looks[k].cost)[:TOGETHER]
+    rows = [(looks[k].hypothesis, looks[k].z, beside[k][0].fit.cost) for k in near]
+    fits = clip.crew.each(clip, _joined, rows)
+    found = [Candidate(fit, lead_of(fit, base), beside[k][1].gain) for k, fit in zip(near, fits, strict=True)]
     together = list(_together(clip, base, singles)) if beside else []
     lines = [f"{first.names[0]} and {second.names[0]}, together" for _, _, first, second in together]
     rows = [(hypothesis, z, min(first.fit.cost, second.fit.cost)) for hypothesis, z, first, second in together]
@@ -125,8 +129,8 @@ def _beside(
         others = [n for n in names if n not in first.names or catalogue()[n].targeted]
         leads = Screen(clip, first.fit, shown(first.fit)).leads(others)
         leads = [x for x in leads if (x.name, x.target) not in set(zip(first.names, first.targets, strict=True))]
-        # Three effects, not three moments of one push.
-        yield from ((first, x) for x in chosen_of(leads, 3, 1) if x.gain > SECOND_PROMISE)
+        # So many effects, not so many moments of one push.
+        yield from ((first, x) for x in chosen_of(leads, SECONDS, 1) if x.gain > SECOND_PROMISE)
 
 
 def _one_cause(one: Candidate, other: Candidate) -> bool:
@@ -184,10 +188,10 @@ def _other(one: Candidate, name: str) -> str:
 
 
 def _second(clip: ClipFit, first: Fit, lead: Lead) -> Fit:
-    """The fit with one more effect."""
+    """The fit with one more effect, after its first steps."""
     one = lead.term(clip.frames)
     hypothesis = first.hypothesis.added(one)
-    return _joined(clip, hypothesis, beginning(clip, hypothesis, first, lead, lead.z(one)), first.cost)
+    return _looked(clip, hypothesis, beginning(clip, hypothesis, first, lead, lead.z(one)), first.cost)
 
 
 def _looked(clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimension"], rival: float) -> Fit:

@@ -147,8 +147,9 @@ LESS, LESS_BESIDE, PART_LESS = 60.0, 40.0, 0.01
 effects at work had gained on seed 11 that were not named was 49 to 197; what a second one gained by chance was up to 12 on five
 clips once fits shared what they had found, and 53 to 126 on a sixth."""
 
-LOOSE = 1.5
-"""Structure of the residuals above which not both of two effects are named."""
+LOOSE, LOOSER, NEARLY = 1.5, 2.0, 0.8
+"""Structure of the residuals above which not both of two effects are named; the same where they close this part of the gap on
+frames that no fit has seen."""
 
 LEFT_OVER, CLEARED = 1.2, 0.6
 """Structure of the residuals that the best single effect leaves, and the part of it that two may leave, where the second clears
@@ -218,12 +219,13 @@ def answer(told: Signs, leads: list[float], video: bool = False) -> Answer:
     weights = SHARPNESS * (np.array(leads) - max(leads)) / max(told.after, 0.3) if leads else np.zeros(0)
     shares = tuple(float(w) for w in np.exp(weights) / np.exp(weights).sum()) if leads else ()
     if _slight(told, video):
-        if told.structure_after > ODD or told.whole > RESTLESS:
+        if told.structure_after > ODD or told.whole > RESTLESS or (video and told.after > FAR_OFF):
             return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
         if told.held_out > UNSEEN:
             return Answer("none", UNLIKELY, shares, AT_WORK["perhaps none"])
         return Answer("none", LIKELY, shares, AT_WORK["none"])
-    if told.closed < CLOSES or (video and told.after > FAR_OFF):
+    bends = told.closed < CLOSES and not (video and told.inimitable and told.held_out > ASKED)
+    if bends or (video and told.after > FAR_OFF):
         return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
     paired = _paired(told, video)
     # Where one effect is named, what it leaves by itself counts.
@@ -241,10 +243,10 @@ def answer(told: Signs, leads: list[float], video: bool = False) -> Answer:
 def _slight(told: Signs, video: bool) -> bool:
     """Whether no effect leads by enough to say that something is missing."""
     quiet, asked = QUIET_OF_A_VIDEO if video else QUIET
-    if video and told.closed < CLOSES and told.lead < asked and told.structure_after <= STRANGE:
-        return True
     if video and told.inimitable:
         return told.lead < ASKED
+    if video and told.closed < CLOSES and told.lead < asked and told.structure_after <= STRANGE:
+        return True
     return told.lead < (NAMED if told.structure_before >= quiet else asked)
 
 
@@ -266,7 +268,7 @@ def upheld(said: Answer, compared: Compared, closed_of: Callable[[Fit], float]) 
 def _allowed(told: Signs, paired: bool, video: bool) -> float:
     """Structure that residuals may have for what is named to be all that is missing."""
     if paired:
-        return LOOSE if video else np.inf
+        return (LOOSER if told.closed >= NEARLY else LOOSE) if video else np.inf
     allowed = STRANGE * (1 + max(told.margin, 0.0) / CLEAR)
     return min(allowed, STRANGEST) if video else allowed
 
