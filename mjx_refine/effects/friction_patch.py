@@ -68,9 +68,8 @@ class FrictionPatch(EffectKind):
             for friction in (0.25 * own, own + 0.3, own + 0.8)
         ]
         width = [np.array([0.5 * v[2], 0.5 * v[2], 0.4 * v[2], 0.4]) for v in found]
-        return [
-            Start(v, width=w, places=len(self.starts(view, target)) or 1) for v, w in zip(found, width, strict=True)
-        ]
+        places = max(len(self.starts(view, target)), 1)
+        return [Start(v, width=w, places=places) for v, w in zip(found, width, strict=True)]
 
     def window(self, view: FitView, target: int, values: np.ndarray) -> tuple[int, int] | None:
         inside = self._inside(view, values)[:, self.struck(view, values)]
