@@ -19,7 +19,7 @@ from mjx_refine.diagnosis.pace import STEPS, Standing, descended
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.roam import GENERATIONS, ROAMED, Strategy
 from mjx_refine.diagnosis.settled import Loose, Settled
-from mjx_refine.diagnosis.slack import PART, Impact, Slack, Slacks, contacts, kicked, too_wide
+from mjx_refine.diagnosis.slack import PART, Contacts, Impact, Slack, Slacks, contacts, kicked, too_wide
 from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
 from mjx_refine.scene import Shape
 from mjx_refine.search.residuals import slowed
@@ -117,14 +117,19 @@ class ClipFit:
         if not np.isfinite(poses).all():
             return 0
         plain = self.poses(*fit.ordinary)[0] if fit.hypothesis.terms else None
-        found, long = contacts(batch, poses, plain, self.simulator.fps)
-        sharp = self.noise
+        found, long = self._contacts(batch, poses, plain)
         still = self.predictor(poses[None], batch)
         kicks = self.kicks(batch, poses, still, [*found, *long], PART) if found or long else None
-        marks = [(i.target, i.frame) for i in found]
-        self._loose = Loose(too_wide(self.measured), kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
+        self._loose = self._loosened(batch, poses, found, still, kicks)
         self.set_slackness(self.slackness)
         return len(found)
+
+    def _contacts(self, batch: SceneBatch, poses: np.ndarray, plain: np.ndarray | None) -> Contacts:
+        return contacts(batch, poses, plain, self.simulator.fps)
+
+    def _loosened(self, batch: SceneBatch, poses: np.ndarray, found: list[Impact], still: Prediction, kicks) -> Loose:
+        sharp, marks = self.noise, [(i.target, i.frame) for i in found]
+        return Loose(too_wide(self.measured), kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
 
     def kicks(self, batch: SceneBatch, poses: np.ndarray, still: Prediction, found: list[Impact], part: float) -> Parts:
         """What impacts that err by ``part`` of themselves change in what ``still`` predicts, one standard deviation a row."""
@@ -174,8 +179,7 @@ class ClipFit:
         After contacts the paths of bodies jump with the smallest change of a parameter. Of three rollouts on a line, two
         of them a posterior standard deviation to either side, the second difference is what no least squares can follow.
         """
-        low, high = fit.hypothesis.bounds
-        z = np.clip(drawn(fit.z, fit.curvature, seed), low, high)
+        z = np.clip(drawn(fit.z, fit.curvature, seed), *fit.hypothesis.bounds)
         told = self.predictor(self.poses(fit.hypothesis, z), fit.hypothesis.batch(z))
         white = self.measured.split(self.residuals(fit.hypothesis, fit.z[None])[0][0])
         counts = self.counts.of(self.measured.parts)
@@ -333,8 +337,7 @@ class ClipFit:
 
     def best_of(self, hypothesis: Hypothesis, points: Float[np.ndarray, "points dimension"], keep=None) -> np.ndarray:
         """The point with the least cost."""
-        low, high = hypothesis.bounds
-        points = np.clip(points, low, high)
+        points = np.clip(points, *hypothesis.bounds)
         return points[int(np.argmin(self.residuals(hypothesis, points, keep)[1]))]
 
     @remembered
@@ -344,12 +347,11 @@ class ClipFit:
         After contacts the residuals are jagged, and derivatives see only the nearest step.
         """
         generator = np.random.default_rng(seed)
-        low, high = fit.hypothesis.bounds
         for _ in range(rounds):
             factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
             width = np.geomspace(0.3, 8.0, count)[:, None]
             draws = generator.standard_normal((count, len(fit.z))) @ factor * width
-            points = np.clip(fit.z + draws, low, high)
+            points = np.clip(fit.z + draws, *fit.hypothesis.bounds)
             _, costs = self.residuals(fit.hypothesis, points, keep, scale)
             best = np.argsort(costs)[:1]
             if not costs[best[0]] < fit.cost + 0.1 * abs(fit.cost):
@@ -365,11 +367,10 @@ class ClipFit:
         ``widths``: of the first generation in each round [posterior standard deviations]."""
         for width in widths:
             factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
-            low, high = fit.hypothesis.bounds
             best, point = fit.cost, fit.z
             strategy = Strategy(len(fit.z), width, seed)
             for _ in range(GENERATIONS):
-                points = np.clip(fit.z + strategy.ask() @ factor, low, high)
+                points = np.clip(fit.z + strategy.ask() @ factor, *fit.hypothesis.bounds)
                 costs = self.residuals(fit.hypothesis, points)[1]
                 if np.min(costs) < best:
                     best, point = float(np.min(costs)), points[int(np.argmin(costs))]

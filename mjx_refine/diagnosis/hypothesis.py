@@ -118,7 +118,7 @@ class Hypothesis:
         """Which coordinates change the rollout, and not just how it is seen."""
         parts = [np.array([not p.field.startswith("camera") for p in self.space.parameters], bool)]
         for t in self.terms:
-            acts = t.kind.physical or type(t.kind).frame_times is not EffectKind.frame_times
+            acts = t.kind.physical or t.kind.retimes
             parts.append(np.full(int(t.free.sum()), acts))
         return np.concatenate(parts)
 

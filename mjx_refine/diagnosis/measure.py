@@ -32,9 +32,9 @@ FRESH, STALE = 1.0, 0.1
 FLOW_PART = 0.08
 """Error of measured flow that is smooth over an object, as a part of its motion; half where its noise is stated."""
 
-
 BLURRED = 2.0
-"""How far flow that was measured carries an object's motion beyond its outline [px]."""
+"""How far flow that was measured is thought to carry an object's motion beyond its outline [px]: flow is looked at so far inside
+masks, and without this a bounce without effect (seed 12, 054) led by 72 for masks that are too fat."""
 
 
 class Parts(NamedTuple):

@@ -70,17 +70,14 @@ def pairs_of(
     beside = list(_beside(clip, singles, names, shown))
     lines = [f"{first.names[0]} and {lead.name}" for first, lead in beside]
     looks = clip.crew.each(clip, _second, [(first.fit, lead) for first, lead in beside], told, lines)
-    near = sorted(range(len(looks)), key=lambda k: looks[k].cost)[:TOGETHER]
-    rows = [(looks[k].hypothesis, looks[k].z, beside[k][0].fit.cost) for k in near]
-    fits = clip.crew.each(clip, _joined, rows)
-    found = [Candidate(fit, lead_of(fit, base), beside[k][1].gain) for k, fit in zip(near, fits, strict=True)]
+    fits = _best_joined(clip, looks, [first.fit.cost for first, _ in beside])
+    found = [Candidate(fit, lead_of(fit, base), beside[k][1].gain) for k, fit in fits]
     together = list(_together(clip, base, singles)) if beside else []
     lines = [f"{first.names[0]} and {second.names[0]}, together" for _, _, first, second in together]
     rows = [(hypothesis, z, min(first.fit.cost, second.fit.cost)) for hypothesis, z, first, second in together]
     looks = clip.crew.each(clip, _looked, rows, told, lines)
-    near = sorted(range(len(rows)), key=lambda k: looks[k].cost)[:TOGETHER]
-    fits = clip.crew.each(clip, _joined, [(rows[k][0], looks[k].z, rows[k][2]) for k in near])
-    found += [Candidate(fit, lead_of(fit, base), 0.0) for fit in fits]
+    fits = _best_joined(clip, looks, [rival for _, _, rival in rows])
+    found += [Candidate(fit, lead_of(fit, base), 0.0) for _, fit in fits]
     found = _gone_on(clip, base, found)
     if "hidden_obstacle" in names:
         found += _walled(clip, base, singles, found, shown, told)
@@ -196,6 +193,13 @@ def _second(clip: ClipFit, first: Fit, lead: Lead) -> Fit:
 
 def _looked(clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimension"], rival: float) -> Fit:
     return clip.fit(hypothesis, z, ITERATIONS, rival=rival, attempts=LOOK)
+
+
+def _best_joined(clip: ClipFit, looks: list[Fit], rivals: list[float]) -> list[tuple[int, Fit]]:
+    """The best of some fits after their first steps: their places, and the fits once they have gone on."""
+    near = sorted(range(len(looks)), key=lambda k: looks[k].cost)[:TOGETHER]
+    rows = [(looks[k].hypothesis, looks[k].z, rivals[k]) for k in near]
+    return list(zip(near, clip.crew.each(clip, _joined, rows), strict=True))
 
 
 def _joined(clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimension"], rival: float) -> Fit:

@@ -21,10 +21,10 @@ def patches_from_pushes(clip: ClipFit, pushes: Sequence[tuple[Fit, FitView]]) ->
     """For each fit, whose only effect is a push, the best with a patch that is crossed about then; None where its object is not
     on the floor."""
     begun = clip.crew.each(clip, _crossings, list(pushes))
-    fits = iter(clip.crew.each(clip, _begun, [row for rows in begun for row in rows]))
+    fits = iter(clip.crew.each(clip, _fitted, [(*row, LOOK) for rows in begun for row in rows]))
     best = [max((next(fits) for _ in rows), key=lambda fit: fit.evidence, default=None) for rows in begun]
     there = [fit for fit in best if fit is not None]
-    ended = iter(clip.crew.each(clip, _ended, [(fit,) for fit in there]))
+    ended = iter(clip.crew.each(clip, _fitted, [(fit.hypothesis, fit.z, ITERATIONS) for fit in there]))
     return [None if fit is None else next(ended) for fit in best]
 
 
@@ -38,20 +38,17 @@ def _crossings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis,
     starts = FrictionPatch().crossed(dataclasses.replace(view, poses=poses), push.target, frame)
     if not starts:
         return []
-    rest = dataclasses.replace(fit.hypothesis, terms=())
-    base = fit.z[: rest.dimension]
-    rows = []
-    for start in starts:
-        one = term_of("friction_patch", -1, start, clip.frames)
-        hypothesis = rest.added(one)
-        z = np.concatenate([base, 0 * one.centre[one.free]])
-        rows.append((float(clip.residuals(hypothesis, z[None])[1][0]), hypothesis, z))
-    return [(hypothesis, z) for _, hypothesis, z in sorted(rows, key=lambda row: row[0])[:BEGUN]]
+    plain, base = fit.ordinary
+    terms = [term_of("friction_patch", -1, start, clip.frames) for start in starts]
+    at = [np.concatenate([base[0], (one.centre - terms[0].centre) / terms[0].width]) for one in terms]
+    white, costs = clip.residuals(plain.added(terms[0]), np.array(at))
+    # Without the prior, which is the first one's.
+    left = np.where(np.isfinite(costs), (white**2).sum(1), np.inf)
+    nothing = np.zeros(len(terms[0].centre))
+    return [
+        (plain.added(terms[k]), np.concatenate([base[0], nothing])) for k in np.argsort(left, kind="stable")[:BEGUN]
+    ]
 
 
-def _begun(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray) -> Fit:
-    return clip.fit(hypothesis, z, LOOK)
-
-
-def _ended(clip: ClipFit, fit: Fit) -> Fit:
-    return clip.fit(fit.hypothesis, fit.z, ITERATIONS)
+def _fitted(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray, iterations: int) -> Fit:
+    return clip.fit(hypothesis, z, iterations)

@@ -26,7 +26,6 @@ from mjx_refine.view.seen import MANY, changed_moments, directions_for, outline_
 SIZES = (8, 48)
 """Batch sizes that are compiled: a line search, and the derivatives of two objects with an effect. More are cut up."""
 
-
 EDGE = 0.5
 """Over what distance from an outline flow becomes that of what lies beside it [px]."""
 

@@ -136,7 +136,7 @@ class Screen:
                 rows.append(row)
         one = dataclasses.replace(term(kind.name, target, frames, starts[0].values), free=np.zeros(len(rows[0]), bool))
         hypothesis = self.fit.hypothesis.added(one)
-        acts = kind.physical or type(kind).frame_times is not EffectKind.frame_times
+        acts = kind.physical or kind.retimes
         parts = []
         for first in range(0, len(rows), MOST_ROWS):
             values = np.array(rows[first : first + MOST_ROWS])

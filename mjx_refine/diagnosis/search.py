@@ -11,7 +11,7 @@ import numpy as np
 from mjx_refine.diagnosis.base import base_space, stored_base
 from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_of
 from mjx_refine.diagnosis.exchange import Fitted, Key, alone, at_least_nothing, exchanged
-from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import beginning, chosen_of
 from mjx_refine.diagnosis.measure import Measured, measure
@@ -62,6 +62,9 @@ THIN = 1.0
 
 FORGIVING = 40.0
 """Scale of the robust loss while a fit is far off [noise widths]."""
+
+Row = tuple[Fit, Lead, float]
+"""Where a lead was seen, the lead, and the scale of the robust loss with which it was looked for."""
 
 
 def compare(
@@ -122,18 +125,15 @@ def _singles(
         view = view_of(clip, base, observation, masks_of)
         ahead = Screen(clip, base, view)
         chosen = chosen_of(ahead.leads(names), FAMILIES if again == 0 else 3)
-        rows = [(base, lead) for lead in chosen]
+        rows = [(base, lead, SCALE) for lead in chosen]
         if again == 0:
             # The base model's fit has bent its parameters towards the effect; from the given scene the way is straight.
             looked = Screen(clip, zero, view_of(clip, zero, observation, masks_of), FORGIVING)
             given = looked.leads(names)
-            rows += [(zero, lead) for lead in chosen_of(given, FRESH, 1)]
-            rows += [(base, lead) for lead in ahead.away(names)]
-            rows += [(zero, lead) for lead in chosen_of(looked.away(names), FRESH)]
-        lines = [f"{lead.name} {target_name(scene.names, lead.target)}".strip() for _, lead in rows]
-        least = min([base.cost, *(fit.cost for fit, _ in fitted.values())])
-        for (_, lead), fit in zip(rows, _fit_leads(clip, rows, base.cost, least, told, lines), strict=True):
-            _keep(fitted, (lead.name, lead.target), fit, lead.gain)
+            rows += [(zero, lead, FORGIVING) for lead in chosen_of(given, FRESH, 1)]
+            rows += [(base, lead, SCALE) for lead in ahead.away(names)]
+            rows += [(zero, lead, FORGIVING) for lead in chosen_of(looked.away(names), FRESH)]
+        _keep_leads(clip, base, fitted, rows, told, scene)
         _in_place_of_pushes(clip, base, fitted, walled, view, names, told)
         best = max((fit for fit, _ in fitted.values()), key=lambda fit: fit.evidence, default=base)
         # What an effect's fit found for the base parameters may serve the base model as well.
@@ -168,11 +168,8 @@ def _from_the_best(
     ground = clip.at(base.hypothesis, z, scale=FORGIVING)
     leads = Screen(clip, ground, view_of(clip, ground, observation, masks_of), FORGIVING).leads(names)
     leads = [lead for lead in leads if (lead.name, lead.target) != best]
-    rows = [(ground, lead) for lead in chosen_of(leads, FROM_BEST, 1)]
-    lines = [f"{lead.name} {target_name(scene.names, lead.target)}".strip() for _, lead in rows]
-    least = min(fit.cost for fit, _ in fitted.values())
-    for (_, lead), fit in zip(rows, _fit_leads(clip, rows, base.cost, least, told, lines, True), strict=True):
-        _keep(fitted, (lead.name, lead.target), fit, lead.gain)
+    rows = [(ground, lead, FORGIVING) for lead in chosen_of(leads, FROM_BEST, 1)]
+    _keep_leads(clip, base, fitted, rows, told, scene)
 
 
 def _as_found_together(
@@ -200,47 +197,32 @@ def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
     return clip.roam(clip.fit(fit.hypothesis, fit.z, 8), seed, ROAMED_AGAIN)
 
 
-def _fit_leads(
-    clip: ClipFit,
-    rows: list[tuple[Fit, Lead]],
-    rival: float,
-    least: float,
-    told: Told,
-    lines: list[str],
-    far: bool = False,
-) -> list[Fit]:
-    """Fits leads from where they were seen, to the end where they may become the best.
-
-    Args:
-      clip: residuals.
-      rows: where a lead was seen, and the lead.
-      rival: what the base model costs.
-      least: of all hypotheses so far.
-      told: called with the line of a fit that is looked at.
-      lines: one a lead.
-    """
-    fits = clip.crew.each(clip, _begun, [(*row, rival, far) for row in rows], told, lines)
-    least = min([least, *(fit.cost for fit in fits)])
-    bound = least + max(CLOSE, SOME_OF_IT * (rival - least))
+def _keep_leads(clip: ClipFit, base: Fit, fitted: Fitted, rows: list[Row], told: Told, scene: Scene) -> None:
+    """Fits leads from where they were seen, to the end where they may become the best, and keeps what is best of its family."""
+    lines = [f"{lead.name} {target_name(scene.names, lead.target)}".strip() for _, lead, _ in rows]
+    fits = clip.crew.each(clip, _begun, [(*row, base.cost) for row in rows], told, lines)
+    least = min([base.cost, *(fit.cost for fit, _ in fitted.values()), *(fit.cost for fit in fits)])
+    bound = least + max(CLOSE, SOME_OF_IT * (base.cost - least))
     near = [k for k, fit in enumerate(fits) if fit.cost < bound * (MAY_ERR if _strikes(fit) else 1.0)]
-    for k, fit in zip(near, clip.crew.each(clip, _ended, [(fits[k], rival) for k in near]), strict=True):
+    for k, fit in zip(near, clip.crew.each(clip, _ended, [(fits[k], base.cost) for k in near]), strict=True):
         fits[k] = fit
-    return fits
+    for (_, lead, _), fit in zip(rows, fits, strict=True):
+        _keep(fitted, (lead.name, lead.target), fit, lead.gain)
 
 
 def _strikes(fit: Fit) -> bool:
     return any(t.kind.strikes for t in fit.hypothesis.terms)
 
 
-def _begun(clip: ClipFit, here: Fit, lead: Lead, rival: float, far: bool = False) -> Fit:
-    """A lead's fit after its first steps; ``far``: from where the base model does not fit."""
+def _begun(clip: ClipFit, here: Fit, lead: Lead, scale: float, rival: float) -> Fit:
+    """A lead's fit after its first steps."""
     one = lead.term(clip.frames)
     hypothesis = here.hypothesis.added(one)
     z = beginning(clip, hypothesis, here, lead, lead.z(one))
-    if far or not here.z.any():
-        z = clip.fit(hypothesis, z, 7, scale=FORGIVING).z
+    if scale > SCALE:
+        z = clip.fit(hypothesis, z, 7, scale=scale).z
     fit = clip.fit(hypothesis, z, 9, rival=rival, attempts=LOOK)
-    if fit.cost > here.cost and here.z.any() and not lead.whole and not far:
+    if fit.cost > here.cost and scale == SCALE and not lead.whole:
         # Where the linear look misleads, the effect grows from nothing.
         fit = clip.fit(hypothesis, np.concatenate([here.z, 0 * lead.z(one)]), 9, rival=rival, attempts=LOOK)
     return fit

@@ -70,6 +70,10 @@ class Impact:
     turn: float
 
 
+Contacts = tuple[list[Impact], list[Impact]]
+"""Impacts, and times on the floor."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Slack:
     """What whitens residuals that share the impacts' errors: r - U d U' r.
@@ -157,7 +161,7 @@ def contacts(
     poses: Float[np.ndarray, "frames objects 7"],
     plain: Float[np.ndarray, "frames objects 7"] | None,
     fps: float,
-) -> tuple[list[Impact], list[Impact]]:
+) -> Contacts:
     """Impacts and times on the floor along a path; what effects themselves do is neither.
 
     Args:
@@ -290,8 +294,7 @@ def states(simulator: Simulator, batch: SceneBatch, poses: np.ndarray) -> tuple[
 
 def _restarted(batch: SceneBatch, pose: np.ndarray, velocity: np.ndarray, spin: np.ndarray, count: int) -> SceneBatch:
     # Frames are counted from here on.
-    whole = dataclasses.replace(batch, effects=tuple(e for e in batch.effects if e.name != "dropped_frames"))
-    many = whole.map(lambda a: np.repeat(a[:1], count, 0))
+    many = acting.untimed(batch).map(lambda a: np.repeat(a[:1], count, 0))
     quaternion = np.repeat(pose[None, :, 3:], count, 0)
     return dataclasses.replace(
         many,

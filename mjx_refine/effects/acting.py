@@ -140,6 +140,11 @@ def floor_rotation(batch: SceneBatch) -> Float[np.ndarray, "batch 3 3"] | None:
     return result
 
 
+def untimed(batch: SceneBatch) -> SceneBatch:
+    """The batch without what changes which frame is shown when."""
+    return dataclasses.replace(batch, effects=tuple(e for kind, e in _acting(batch) if not kind.retimes))
+
+
 def shown_frames(batch: SceneBatch, frames: int) -> Int[np.ndarray, "batch frames"] | None:
     """Which simulated frame is shown in each frame of the clip, or None where they are the same."""
     index = None

@@ -6,7 +6,7 @@ import numpy as np
 
 from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Motion, Start, glance, rim_speed
 
-CROSSED = (0, 1, 2, 4, 8)
+LATE, WIDE = (0, 1, 2, 4, 8), (1, 2, 4, 8)
 """How many frames late an object may be at the middle of a patch, and how many it may take from there to the border."""
 
 
@@ -50,8 +50,7 @@ class FrictionPatch(EffectKind):
                 for wide in (1.0, 2.0):
                     for friction in (0.25 * own, own + 0.5):
                         found.append(np.array([*centre, wide * radius, friction]))
-        width = [np.array([0.5 * v[2], 0.5 * v[2], 0.4 * v[2], 0.4]) for v in found]
-        return [Start(v, width=w, places=max(len(found), 1)) for v, w in zip(found, width, strict=True)]
+        return [_start(v, len(found)) for v in found]
 
     def crossed(self, view: FitView, target: int, frame: int) -> list[Start]:
         """Patches that an object crosses about ``frame``; none where it is not on the floor then."""
@@ -62,14 +61,12 @@ class FrictionPatch(EffectKind):
         pace = float(np.linalg.norm(np.diff(path[max(frame - 3, 0) : frame + 4], axis=0), axis=1).mean())
         found = [
             np.array([*path[int(np.clip(frame + late, 0, len(path) - 1))], np.clip(wide * pace, 0.03, 2.0), friction])
-            for late in CROSSED
-            for wide in CROSSED
-            if wide > 0
+            for late in LATE
+            for wide in WIDE
             for friction in (0.25 * own, own + 0.3, own + 0.8)
         ]
-        width = [np.array([0.5 * v[2], 0.5 * v[2], 0.4 * v[2], 0.4]) for v in found]
         places = max(len(self.starts(view, target)), 1)
-        return [Start(v, width=w, places=places) for v, w in zip(found, width, strict=True)]
+        return [_start(v, places) for v in found]
 
     def window(self, view: FitView, target: int, values: np.ndarray) -> tuple[int, int] | None:
         inside = self._inside(view, values)[:, self.struck(view, values)]
@@ -82,3 +79,9 @@ class FrictionPatch(EffectKind):
     def _inside(self, view: FitView, values: np.ndarray) -> np.ndarray:
         moving = np.linalg.norm(view.velocity, axis=-1) > 0.03
         return (np.linalg.norm(view.poses[..., :2] - values[:2], axis=-1) < values[2]) & view.on_floor & moving
+
+
+def _start(values: np.ndarray, places: int) -> Start:
+    """Where to begin with a patch that might lie at so many ``places``: the larger, the less is known of it."""
+    radius = values[2]
+    return Start(values, width=np.array([0.5 * radius, 0.5 * radius, 0.4 * radius, 0.4]), places=places)

@@ -222,6 +222,11 @@ class EffectKind:
         """Which simulated frame is shown as frame 0, 1, ..., (batch, frames), whole numbers."""
         return None
 
+    @property
+    def retimes(self) -> bool:
+        """Whether it changes which simulated frame is shown when."""
+        return type(self).frame_times is not EffectKind.frame_times
+
     def camera(self, frames: int, fps: float, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """The camera's turn in its own axes (right, up, back), (batch, frames, 3, 3), and its travel [m]."""
         return None

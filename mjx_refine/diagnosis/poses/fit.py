@@ -20,8 +20,7 @@ from mjx_refine.diagnosis.noise import BLUR, Counts, Noise
 from mjx_refine.diagnosis.pace import STEPS
 from mjx_refine.diagnosis.poses.data import Poses, noise_of, rotation_vector
 from mjx_refine.diagnosis.predict import Prediction
-from mjx_refine.diagnosis.settled import Loose
-from mjx_refine.diagnosis.slack import PART, Impact, Slacks, contacts
+from mjx_refine.diagnosis.slack import Contacts, Impact, contacts
 from mjx_refine.diagnosis.store import fingerprint
 from mjx_refine.search.residuals import slowed
 from mjx_refine.sim.backends import Simulator
@@ -169,26 +168,11 @@ class PosesFit(ClipFit):
     def settle_noise(self, fit: Fit, order: int = 2) -> None:
         """Does nothing: the noise is stated, or comes from third differences, which owe nothing to a fit."""
 
-    def allow_slack(self, fit: Fit) -> int:
-        """Lets contacts along a fit's path err from now on; returns how many impacts there are."""
-        batch = fit.hypothesis.batch(fit.z[None])
-        poses = self.poses(fit.hypothesis, fit.z[None])[0]
-        self._loose, self._columns, self._slacks = None, None, Slacks()
-        if not np.isfinite(poses).all():
-            return 0
-        plain = self.poses(*fit.ordinary)[0] if fit.hypothesis.terms else None
-        found, long = self._contacts(batch, poses, plain)
-        sharp = self.noise
-        still = self.predictor(poses[None], batch)
-        kicks = self.kicks(batch, poses, still, [*found, *long], PART) if found or long else None
-        always = self._unseen_turns(batch, poses)
-        self._loose = Loose(always, kicks, lambda factor: self._blurred(sharp, batch, found, factor))
-        self.set_slackness(self.slackness)
-        return len(found)
+    def _loosened(self, batch: SceneBatch, poses: np.ndarray, found: list[Impact], still: Prediction, kicks) -> Loose:
+        blur = functools.partial(self._blurred, self.noise, batch, found)
+        return Loose(self._unseen_turns(batch, poses), kicks, blur)
 
-    def _contacts(
-        self, batch: SceneBatch, poses: np.ndarray, plain: np.ndarray | None
-    ) -> tuple[list[Impact], list[Impact]]:
+    def _contacts(self, batch: SceneBatch, poses: np.ndarray, plain: np.ndarray | None) -> Contacts:
         """Impacts and times on the floor, looked for at a video's rate, which the constants were chosen at."""
         every = max(1, round(self.simulator.fps / VIDEO))
         coarse, rate = poses[::every], self.simulator.fps / every
