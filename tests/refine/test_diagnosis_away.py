@@ -10,11 +10,11 @@ from test_diagnosis import FLIGHT, clip_of
 
 from mjx_refine.diagnosis.base import base_space
 from mjx_refine.diagnosis.diagnose import prepared
-from mjx_refine.diagnosis.fit import ClipFit
+from mjx_refine.diagnosis.fit import SCALE, ClipFit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.leads import beginning
 from mjx_refine.diagnosis.screen import AWAY, Screen
-from mjx_refine.diagnosis.search import _fit_leads
+from mjx_refine.diagnosis.search import _keep_leads
 from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.effects import catalogue
 from mjx_refine.scene import Effect
@@ -56,7 +56,10 @@ def test_such_a_fit_begins_with_all_of_the_step_and_finds_the_effect(rolled):
     assert z[-1] == lead.z(one)[0] != 0.0
     some = dataclasses.replace(lead, step=1e-3 * lead.step, whole=False)
     assert abs(beginning(clip, hypothesis, base, some, some.z(one))[-1]) < abs(z[-1])
-    [fit] = _fit_leads(clip, [(base, lead)], base.cost, base.cost, str, [lead.name])
+    fitted = {}
+    _keep_leads(clip, base, fitted, [(base, lead, SCALE)], lambda line: None, FLIGHT)
+    [(fit, promise)] = fitted.values()
+    assert promise == lead.gain
     assert fit.evidence > base.evidence + 30
     assert fit.hypothesis.values(fit.z[None], 0)[0, 0] == pytest.approx(ANGLE, abs=1.5)
 

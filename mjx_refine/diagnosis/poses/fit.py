@@ -20,6 +20,7 @@ from mjx_refine.diagnosis.noise import BLUR, Counts, Noise
 from mjx_refine.diagnosis.pace import STEPS
 from mjx_refine.diagnosis.poses.data import Poses, noise_of, rotation_vector
 from mjx_refine.diagnosis.predict import Prediction
+from mjx_refine.diagnosis.settled import Loose
 from mjx_refine.diagnosis.slack import Contacts, Impact, contacts
 from mjx_refine.diagnosis.store import fingerprint
 from mjx_refine.search.residuals import slowed
