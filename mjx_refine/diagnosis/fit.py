@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mjx_refine.batch import SceneBatch
+from mjx_refine.diagnosis.apart import beside
 from mjx_refine.diagnosis.chaos import believed, drawn, jaggedness
 from mjx_refine.diagnosis.crew import Crew
 from mjx_refine.diagnosis.fitted import Fit, prior
@@ -284,21 +285,16 @@ class ClipFit:
         cost = 0.5 * (white**2).sum(1) + 0.5 * (prior(hypothesis, z)[0] ** 2).sum(1)
         return white, np.where(prediction.bad, np.inf, cost)
 
-    def jacobian(
-        self, hypothesis: Hypothesis, z: np.ndarray, base: np.ndarray, keep=None, scale: float = SCALE, size=STEPS[0]
-    ):
+    def jacobian(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE, size=STEPS[0]):
         """d residuals / d z (R, D) by differences towards the inside of the bounds."""
-        low, high = hypothesis.bounds
-        step = np.where(z + size > high, -size, size)
-        points = np.clip(z + np.diag(step), low, high)
-        moves = hypothesis.moves
-        poses = np.repeat(self.poses(hypothesis, z[None]), len(z), 0)
-        if moves.any():
-            poses[moves] = self.poses(hypothesis, points[moves])
-        prediction = self.predictor(poses, hypothesis.batch(points))
-        white = self.whitened(self.distances(prediction), keep, scale, hypothesis.excused)
-        change = np.where(prediction.bad[:, None], 0.0, white - base)
-        return (change / step[:, None]).T
+        step = np.where(z + size > hypothesis.bounds[1], -size, size)
+        told = beside(hypothesis, z, step, functools.partial(self.poses, hypothesis))
+        prediction = self.predictor(told.poses, hypothesis.batch(told.points))
+        white = self.rigid(self.distances(prediction), keep, scale)
+        change = np.where(prediction.bad[told.row, None], 0.0, white[told.row] - white[0])
+        change = np.where(told.felt[:, self.measured.objects], change, 0.0)
+        slack = self._slack(keep, hypothesis.excused)
+        return ((change if slack is None else slack(change)) / step[:, None]).T
 
     # --- least squares --------------------------------------------------------------------------------------------
     @remembered
@@ -326,7 +322,7 @@ class ClipFit:
         ended = descended(
             start,
             lambda points: self.residuals(hypothesis, points, keep, scale),
-            lambda z, base, size: self.jacobian(hypothesis, z, base, keep, scale, size),
+            lambda z, _, size: self.jacobian(hypothesis, z, keep, scale, size),
             functools.partial(prior, hypothesis),
             hypothesis.bounds,
             iterations,
@@ -393,7 +389,7 @@ class ClipFit:
     def at(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE) -> Fit:
         """No step, just what holds at ``z``."""
         base, _ = self.residuals(hypothesis, z[None], keep, scale)
-        return self._finished(hypothesis, z, base[0], self.jacobian(hypothesis, z, base[0], keep, scale), keep)
+        return self._finished(hypothesis, z, base[0], self.jacobian(hypothesis, z, keep, scale), keep)
 
 
 def _made(shapes: tuple[Shape, ...], fps: float, measured: Measured, image, frames: int, threads: int) -> ClipFit:

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from mjx_refine.batch import BatchEffect, SceneBatch, scene_from_batch
 from mjx_refine.effects import EffectKind, effect_entry, kind_of
@@ -121,6 +121,17 @@ class Hypothesis:
             acts = t.kind.physical or t.kind.retimes
             parts.append(np.full(int(t.free.sum()), acts))
         return np.concatenate(parts)
+
+    @property
+    def owners(self) -> Int[np.ndarray, "dimension"]:
+        """The object that each coordinate is of, -1 where it is of none alone."""
+        told = [p.index[0] for p in self.space.parameters]
+        return np.array(told + [t.target for t in self.terms for _ in range(int(t.free.sum()))], int)
+
+    @property
+    def couples(self) -> bool:
+        """Whether an effect acts on one object by another's motion."""
+        return any(t.kind.couples for t in self.terms)
 
     def values(self, z: Float[np.ndarray, "batch dimension"], k: int) -> Float[np.ndarray, "batch parameters"]:
         """The numbers of term ``k``."""

@@ -109,6 +109,16 @@ class Measured:
         """All that predictions are compared with."""
         return Parts(self.reach, self.flow, self.moments, self.background)
 
+    @functools.cached_property
+    def objects(self) -> Int[np.ndarray, "residuals"]:
+        """Which object each number of ``Parts.flat`` is of; one past the last: the background."""
+        count = self.reach.shape[1]
+        numbers = np.arange(count)
+        told = [
+            np.broadcast_to(numbers.reshape((1, -1) + (1,) * (p.ndim - 2)), p.shape).ravel() for p in self.parts[:3]
+        ]
+        return np.concatenate([*told, np.full(self.background.size, count)])
+
     @property
     def count(self) -> int:
         """How many numbers are known of outlines and whole masks."""

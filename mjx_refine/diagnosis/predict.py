@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -23,8 +22,9 @@ from mjx_refine.view.outline import Arrays, directions, padded, place, support_o
 from mjx_refine.view.points import point_flow_function
 from mjx_refine.view.seen import MANY, changed_moments, directions_for, outline_function
 
-SIZES = (8, 48)
-"""Batch sizes that are compiled: a line search, and the derivatives of two objects with an effect. More are cut up."""
+ROWS = 8
+"""Candidates that are predicted at a time, a line search's or a part of derivatives': one size is compiled, which takes seconds,
+and a row takes as long in larger ones."""
 
 EDGE = 0.5
 """Over what distance from an outline flow becomes that of what lies beside it [px]."""
@@ -145,11 +145,11 @@ class Predictor:
         return scipy.special.expit((beyond - self.blur) / EDGE)
 
     def _predicted(self, seen: np.ndarray, batch: SceneBatch, count: int):
-        """``_predict`` of rows by batches of ``SIZES``."""
+        """``_predict`` of rows, ``ROWS`` at a time."""
         pixels, found = jnp.asarray(self.pixels, jnp.float32), []
-        for first in range(0, len(seen), SIZES[-1]):
-            rows = slice(first, min(first + SIZES[-1], len(seen)))
-            device = padded(seen[rows], batch[rows], SIZES)
+        for first in range(0, len(seen), ROWS):
+            rows = slice(first, min(first + ROWS, len(seen)))
+            device = padded(seen[rows], batch[rows], (ROWS,))
             # What follows is prepared while this is computed.
             found.append((rows.stop - first, _predict(self.shapes, device, pixels, self.image, count)))
         parts = [jax.tree.map(lambda a, n=n: np.asarray(a, np.float64)[:n], one) for n, one in found]
@@ -158,10 +158,10 @@ class Predictor:
     def warm(self, frames: int) -> None:
         """Compiles predictions of clips of so many frames."""
         count, pixels = len(self.shapes), jnp.asarray(self.pixels, jnp.float32)
-        for directed, size in itertools.product((DIRECTIONS, 0, MANY), SIZES):
-            poses = np.tile([0.0, 2.0, 0.5, 1.0, 0.0, 0.0, 0.0], (size, frames, count, 1))
-            place, angle = np.tile([0.0, -2.0, 4.0], (size, 1)), np.ones(size)
-            arrays = (poses, np.full((size, count, 3), 0.3), place, angle, angle)
+        for directed in (DIRECTIONS, 0, MANY):
+            poses = np.tile([0.0, 2.0, 0.5, 1.0, 0.0, 0.0, 0.0], (ROWS, frames, count, 1))
+            place, angle = np.tile([0.0, -2.0, 4.0], (ROWS, 1)), np.ones(ROWS)
+            arrays = (poses, np.full((ROWS, count, 3), 0.3), place, angle, angle)
             _predict(self.shapes, tuple(jnp.asarray(a, jnp.float32) for a in arrays), pixels, self.image, directed)
 
     def _seen_flow(self, flow: np.ndarray, batch: SceneBatch, focal: np.ndarray) -> np.ndarray:

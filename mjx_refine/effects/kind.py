@@ -179,6 +179,7 @@ class EffectKind:
       targeted: whether it acts on one object.
       channel: what of the pictures it changes.
       physical: whether it acts in the rollout (otherwise in how the rollout is seen).
+      couples: whether what it does to one object depends on how another moves.
       strikes: whether it acts as impacts with something unseen, whose impulse nobody knows well.
       drawn: whether it changes outlines (``outline``) or the picture (``warp``).
       imitated: whether ordinary parameters can imitate much of it, so that its fit begins with much of it as well.
@@ -191,6 +192,7 @@ class EffectKind:
     targeted: ClassVar[bool] = False
     channel: ClassVar[Channel] = "motion"
     physical: ClassVar[bool] = False
+    couples: ClassVar[bool] = False
     strikes: ClassVar[bool] = False
     drawn: ClassVar[bool] = False
     imitated: ClassVar[bool] = False

@@ -11,6 +11,9 @@ SWEEPS = 6
 """Over all scales. Corners of a square 80 px wide that loses 7 px on every side, turned anyhow, are then off by 0.3 px in 128
 directions, most of it because no direction is quite an edge's normal; taking the same off everywhere errs by 2.8 px."""
 
+BLOCK = 256
+"""Outlines that are swept together: what a core's cache holds."""
+
 
 class MaskBias(EffectKind):
     """Masks reach ``width`` pixels too far on every side.
@@ -58,9 +61,18 @@ def inner(bounds: Float[np.ndarray, "*grid directions"]) -> Float[np.ndarray, "*
     """
     count = bounds.shape[-1]
     scales = [2**k for k in reversed(range(count.bit_length())) if 2**k < count / 4]
-    h = bounds
-    for _ in range(SWEEPS):
-        for step in scales:
-            beside = np.roll(h, step, -1) + np.roll(h, -step, -1)
-            h = np.minimum(h, beside / (2 * np.cos(2 * np.pi * step / count)))
-    return h
+    flat, reach = bounds.reshape(-1, count), scales[0]
+    result = np.empty(flat.shape, flat.dtype)
+    for first in range(0, len(flat), BLOCK):
+        part = flat[first : first + BLOCK]
+        # Directions come first, with as many more at both ends as the greatest step reaches: neighbours are slices.
+        ring = np.empty((count + 2 * reach, len(part)), flat.dtype)
+        h, beside = ring[reach : reach + count], np.empty((count, len(part)), flat.dtype)
+        h[:] = part.T
+        for step in scales * SWEEPS:
+            ring[reach - step : reach], ring[reach + count : reach + count + step] = h[-step:], h[:step]
+            np.add(ring[reach - step :][:count], ring[reach + step :][:count], out=beside)
+            beside *= 0.5 / np.cos(2 * np.pi * step / count)
+            np.minimum(h, beside, out=h)
+        result[first : first + BLOCK] = h.T
+    return result.reshape(bounds.shape)

@@ -10,7 +10,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from mjx_refine.batch import BatchEffect, SceneBatch
@@ -262,21 +262,17 @@ def _widened(masks: np.ndarray, poses: np.ndarray, one: SceneBatch, size, fps: f
 
     Distances are those of a grid of a third of a pixel (exact Euclidean: Maurer et al. 2003), hence right to 0.2 px.
     """
-    lines, columns = (np.nonzero((masks > 0).any((0, other)))[0] for other in (2, 1))
-    if len(lines) == 0 or width == 0:
+    if width == 0 or not masks.any():
         return masks
     margin = int(np.ceil(abs(width))) + 2
-    part = []
-    for index, full in ((lines, size[1]), (columns, size[0])):
-        # In steps of 32 px, so that few sizes are compiled.
-        first, last = (int(index.min()) - margin) // 32 * 32, -(-(int(index.max()) + margin + 1) // 32) * 32
-        part.append(slice(max(first, 0), min(last, full)))
-    grids = [np.arange(p.start + 0.5 / FINE, p.stop, 1 / FINE) for p in part]
+    lines, columns = (_windows((masks > 0).any(axis), margin) for axis in (2, 1))
     result = masks.copy()
-    for t in range(len(masks)):
-        middle = FINE // 2
-        depth = np.full((len(one.shapes), *result[t][part[0], part[1]].shape), np.inf)
-        fine = _fine_ids(poses, one, grids, size, fps, t)
+    middle = FINE // 2
+    for t in np.nonzero(masks.any((1, 2)))[0]:
+        part = (lines[t], columns[t])
+        grids = [np.arange(p.start + 0.5 / FINE, p.stop, 1 / FINE) for p in part]
+        depth = np.full((len(one.shapes), *result[t][part].shape), np.inf)
+        fine = _fine_ids(poses, one, grids, size, fps, int(t))
         for n in range(len(one.shapes)):
             inside = fine == n + 1
             if not inside.any():
@@ -287,8 +283,20 @@ def _widened(masks: np.ndarray, poses: np.ndarray, one: SceneBatch, size, fps: f
             depth[n][near] = signed[middle::FINE, middle::FINE]
         best = depth.argmin(0)
         grown = np.where(depth.min(0) <= width, best + 1, 0)
-        result[t][part[0], part[1]] = grown
+        result[t][part] = grown
     return result
+
+
+def _windows(covered: Bool[np.ndarray, "frames pixels"], margin: int) -> list[slice]:
+    """Of each frame a range that holds what is covered and ``margin`` more on both sides [px], where the picture has that.
+
+    All are as long as the longest needs, in steps of 32 px, so that few sizes are compiled.
+    """
+    full = covered.shape[1]
+    first = np.where(covered.any(1), covered.argmax(1), 0) - margin
+    last = np.where(covered.any(1), full - covered[:, ::-1].argmax(1), 1) + margin
+    length = min(-(-int((last - first).max()) // 32) * 32, full)
+    return [slice(k, k + length) for k in np.clip(first, 0, full - length).tolist()]
 
 
 def _around(inside: np.ndarray, margin: int) -> slice:

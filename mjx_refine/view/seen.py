@@ -84,10 +84,11 @@ def changed_moments(
 
 def polygon_sums(points: Float[np.ndarray, "*grid corners 2"]) -> Float[np.ndarray, "*grid 3"]:
     """Integrals of 1, x and y over polygons, positive for those that turn from x towards y (Green's theorem)."""
-    following = np.roll(points, -1, axis=-2)
-    cross = points[..., 0] * following[..., 1] - points[..., 1] * following[..., 0]
-    first = ((points + following) * cross[..., None]).sum(-2) / 6
-    return np.concatenate([cross.sum(-1, keepdims=True) / 2, first], -1)
+    x, y = np.ascontiguousarray(points[..., 0]), np.ascontiguousarray(points[..., 1])
+    later_x, later_y = (np.concatenate([a[..., 1:], a[..., :1]], -1) for a in (x, y))
+    cross = x * later_y - later_x * y
+    first = [np.einsum("...i,...i->...", a, cross) / 6 for a in (x + later_x, y + later_y)]
+    return np.stack([cross.sum(-1) / 2, *first], -1)
 
 
 def focal_length(batch: SceneBatch, image: tuple[int, int]) -> Float[np.ndarray, "batch"]:

@@ -213,14 +213,14 @@ class PosesFit(ClipFit):
         """As ``ClipFit.expected``, with the samples' weight."""
         return max(self.weight * super().expected(beside), 1e-9)
 
-    def jacobian(self, hypothesis, z, base, keep=None, scale=SCALE, size=STEPS[0]):
+    def jacobian(self, hypothesis, z, keep=None, scale=SCALE, size=STEPS[0]):
         """As ``ClipFit.jacobian``, in one rollout, since every parameter moves something."""
         low, high = hypothesis.bounds
         step = np.where(z + size > high, -size, size)
-        points = np.clip(z + np.diag(step), low, high)
+        points = np.concatenate([z[None], np.clip(z + np.diag(step), low, high)])
         prediction = self.predictor(self.poses(hypothesis, points), hypothesis.batch(points))
         white = self.whitened(self.distances(prediction), keep, scale, hypothesis.excused)
-        return (np.where(prediction.bad[:, None], 0.0, white - base) / step[:, None]).T
+        return (np.where(prediction.bad[1:, None], 0.0, white[1:] - white[0]) / step[:, None]).T
 
     def distances(self, prediction: Prediction) -> Parts:
         """Simulated minus measured [rad], [m]; NaN where nothing was measured."""

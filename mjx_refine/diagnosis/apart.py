@@ -1,0 +1,114 @@
+"""Objects that never meet: one rollout tells derivatives by a number of each (Curtis, Powell and Reid 1974)."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import connected_components
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.sim.model import model_fields
+
+
+@dataclasses.dataclass(frozen=True)
+class Beside:
+    """Points beside one at which derivatives are asked for.
+
+    Attributes:
+      points: the point itself, and then those beside it.
+      poses: of the rollouts there.
+      row: beside which of them each coordinate is moved.
+      felt: which objects' residuals each coordinate changes there, and in the last column whether the background's.
+    """
+
+    points: Float[np.ndarray, "rows dimension"]
+    poses: Float[np.ndarray, "rows frames objects 7"]
+    row: Int[np.ndarray, "dimension"]
+    felt: Bool[np.ndarray, "dimension objects_and_background"]
+
+
+def beside(
+    hypothesis: Hypothesis,
+    z: Float[np.ndarray, "dimension"],
+    step: Float[np.ndarray, "dimension"],
+    poses_of: Callable[[np.ndarray], np.ndarray],
+) -> Beside:
+    """Points beside ``z``, by a step along each coordinate; of objects that do not meet in any of them, several at once.
+
+    Args:
+      hypothesis: whose coordinates they are.
+      z: the point.
+      step: of each coordinate.
+      poses_of: rollouts at points, one a row.
+    """
+    still = poses_of(z[None])
+    met = _meetings(hypothesis, z[None], still) | hypothesis.couples
+    rows = moved_together(hypothesis.owners, companies(met), hypothesis.moves)
+    points, poses = _rolled(hypothesis, z, rows * step, still, poses_of)
+    company = companies(met | _meetings(hypothesis, points, poses))
+    if len(rows) < len(z) and (company != companies(met)).any():
+        rows = moved_together(hypothesis.owners, np.zeros_like(company), hypothesis.moves)
+        points, poses = _rolled(hypothesis, z, rows * step, still, poses_of)
+    owner = hypothesis.owners
+    several = rows.sum(1)[rows.argmax(0)] > 1
+    felt = ~several[:, None] | (company[owner][:, None] == np.append(company, -1))
+    return Beside(np.concatenate([z[None], points]), np.concatenate([still, poses]), 1 + rows.argmax(0), felt)
+
+
+def _rolled(hypothesis: Hypothesis, z: np.ndarray, steps: np.ndarray, still: np.ndarray, poses_of):
+    points, poses = np.clip(z + steps, *hypothesis.bounds), np.repeat(still, len(steps), 0)
+    moves = (steps[:, hypothesis.moves] != 0).any(1)
+    if moves.any():
+        poses[moves] = poses_of(points[moves])
+    return points, poses
+
+
+def _meetings(hypothesis: Hypothesis, points: np.ndarray, poses: np.ndarray) -> Bool[np.ndarray, "objects objects"]:
+    batch: SceneBatch = hypothesis.batch(points)
+    return meetings(poses, model_fields(batch).geom_rbound)
+
+
+def meetings(
+    poses: Float[np.ndarray, "batch frames objects 7"], radius: Float[np.ndarray, "batch objects"]
+) -> Bool[np.ndarray, "objects objects"]:
+    """Which two bounding spheres [m] meet in some candidate, in a frame or between two, where paths are taken to be straight."""
+    place = poses[..., :3]
+    apart = place[:, :, :, None] - place[:, :, None]
+    moved = np.diff(apart, axis=1)
+    length = np.maximum((moved**2).sum(-1, keepdims=True), 1e-12)
+    nearest = np.clip(-(apart[:, :-1] * moved).sum(-1, keepdims=True) / length, 0.0, 1.0)
+    between = apart[:, :-1] + nearest * moved
+    least = np.linalg.norm(np.concatenate([apart, between], 1), axis=-1).min(1, initial=np.inf)
+    return (least < radius[:, :, None] + radius[:, None]).any(0) & ~np.eye(radius.shape[1], dtype=bool)
+
+
+def companies(met: Bool[np.ndarray, "objects objects"]) -> Int[np.ndarray, "objects"]:
+    """The number of each object's company: of all that meet, directly or by others."""
+    return np.asarray(connected_components(met, directed=False)[1])
+
+
+def moved_together(
+    owner: Int[np.ndarray, "dimension"], company: Int[np.ndarray, "objects"], moves: Bool[np.ndarray, "dimension"]
+) -> Bool[np.ndarray, "rows dimension"]:
+    """Which coordinates are moved in each candidate, every one in exactly one.
+
+    Args:
+      owner: the object that each coordinate is of; -1: of none alone.
+      company: of each object.
+      moves: which coordinates change the rollout: those go together, so that few rollouts are needed.
+    """
+    alone = [[k] for k in np.nonzero(owner < 0)[0]]
+    queues = [
+        sorted(np.nonzero((owner >= 0) & (company[owner] == c))[0], key=lambda k: not moves[k])
+        for c in range(int(company.max()) + 1)
+    ]
+    rows = alone + [[k for k in row if k is not None] for row in itertools.zip_longest(*queues)]
+    told = np.zeros((len(rows), len(owner)), bool)
+    for row, columns in zip(told, rows, strict=True):
+        row[columns] = True
+    return told
