@@ -15,6 +15,9 @@ from mjx_refine.search.problem import Problem
 ITERATIONS = 8
 """Of least squares: it begins where the fit with erring contacts ended."""
 
+COARSE = (120, 80)
+"""Resolution at which scenes are compared whose every picture is drawn [px]."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Replay:
@@ -29,7 +32,8 @@ def replays(clip: ClipFit, fits: list[Fit], problem: Problem, matching: tuple[in
     """For each fit the scene that replays the clip best, its effects as they were fitted; afterwards contacts may not err.
 
     Least squares goes on over the base parameters alone; what it finds, where it began, and the scene that was given with
-    the effects put in, are compared by fitness, so that no scene replays the clip worse than the given one does.
+    the effects put in, are compared by fitness, so that no scene replays the clip worse than the given one does (where
+    effects change what is seen, as small pictures show it).
 
     Args:
       clip: its slack is forgotten.
@@ -51,8 +55,13 @@ def _replay(clip: ClipFit, fit: Fit, rigid: np.ndarray, problem: Problem, matchi
     held = _held(fit)
     here, given = fit.z[: held.dimension], np.zeros(held.dimension)
     scenes = [held.scene(z, clip.frames) for z in (rigid, here, given)]
-    scores = problem.score(scenes, matching)
+    # To draw every picture takes seconds a scene: which is best is seen in small ones.
+    drawn = any(t.kind.drawn for t in held.terms)
+    scores = problem.score(scenes, matching, COARSE if drawn else None)
     best = int(np.argmax(np.nan_to_num(scores.fitness, nan=-np.inf)))
+    if drawn:
+        scores = problem.score([scenes[best]], matching)
+        return Replay(scenes[best], float(scores.iou[0]), float(scores.epe[0]))
     return Replay(scenes[best], float(scores.iou[best]), float(scores.epe[best]))
 
 

@@ -102,11 +102,13 @@ class Problem:
             self._scorers[key] = made(shapes, self.observation, matching, resolution, self.options.weights)
         return self._scorers[key]
 
-    def score(self, scenes: list[Scene], matching: tuple[int, ...]) -> Scores:
-        """Full-resolution scores of scenes of one kind, simulated by C MuJoCo."""
+    def score(
+        self, scenes: list[Scene], matching: tuple[int, ...], resolution: tuple[int, int] | None = None
+    ) -> Scores:
+        """Scores of scenes of one kind at a resolution, full if None, simulated by C MuJoCo."""
         batch = batch_with_effects(scenes)
         poses = self.reference(batch.shapes).rollout(batch, self.observation.length)
-        return self.scorer(batch.shapes, matching, pictures=needs_pictures(batch))(poses, batch)
+        return self.scorer(batch.shapes, matching, resolution, needs_pictures(batch))(poses, batch)
 
     def columns(self, matching: tuple[int, ...]) -> tuple[int, ...]:
         """For each object the column of ``seen`` that it is matched to, or -1."""

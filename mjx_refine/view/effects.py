@@ -265,44 +265,32 @@ def _widened(masks: np.ndarray, poses: np.ndarray, one: SceneBatch, size, fps: f
     if width == 0 or not masks.any():
         return masks
     margin = int(np.ceil(abs(width))) + 2
-    lines, columns = (_windows((masks > 0).any(axis), margin) for axis in (2, 1))
-    result = masks.copy()
-    middle = FINE // 2
+    middle, result = FINE // 2, masks.copy()
+    count = len(one.shapes)
+    covered = masks[:, None] == np.arange(1, count + 1)[:, None, None]
+    # Of each object in each frame, as long as the longest needs, so that one size is compiled.
+    lines, columns = (_windows(covered.any(axis), margin) for axis in (3, 2))
     for t in np.nonzero(masks.any((1, 2)))[0]:
-        part = (lines[t], columns[t])
-        grids = [np.arange(p.start + 0.5 / FINE, p.stop, 1 / FINE) for p in part]
-        depth = np.full((len(one.shapes), *result[t][part].shape), np.inf)
-        fine = _fine_ids(poses, one, grids, size, fps, int(t))
-        for n in range(len(one.shapes)):
-            inside = fine == n + 1
-            if not inside.any():
-                continue
-            near = tuple(_around(inside.any(1 - axis), margin) for axis in range(2))
-            edges = np.pad(inside[tuple(slice(p.start * FINE, p.stop * FINE) for p in near)], 1, mode="edge")
-            signed = _signed_distance(edges)[1:-1, 1:-1] / FINE
-            depth[n][near] = signed[middle::FINE, middle::FINE]
-        best = depth.argmin(0)
-        grown = np.where(depth.min(0) <= width, best + 1, 0)
-        result[t][part] = grown
+        depth = np.full((count, *result[t].shape), np.inf)
+        for n in np.nonzero(covered[t].any((1, 2)))[0]:
+            part = (lines[t][n], columns[t][n])
+            grids = [np.arange(p.start + 0.5 / FINE, p.stop, 1 / FINE) for p in part]
+            inside = _fine_ids(poses, one, grids, size, fps, int(t)) == n + 1
+            if inside.any():
+                edges = np.pad(inside, 1, mode="edge")
+                depth[n][part] = (_signed_distance(edges)[1:-1, 1:-1] / FINE)[middle::FINE, middle::FINE]
+        result[t] = np.where(depth.min(0) <= width, depth.argmin(0) + 1, 0)
     return result
 
 
-def _windows(covered: Bool[np.ndarray, "frames pixels"], margin: int) -> list[slice]:
-    """Of each frame a range that holds what is covered and ``margin`` more on both sides [px], where the picture has that.
-
-    All are as long as the longest needs, in steps of 32 px, so that few sizes are compiled.
-    """
-    full = covered.shape[1]
-    first = np.where(covered.any(1), covered.argmax(1), 0) - margin
-    last = np.where(covered.any(1), full - covered[:, ::-1].argmax(1), 1) + margin
+def _windows(covered: Bool[np.ndarray, "frames objects pixels"], margin: int) -> list[list[slice]]:
+    """For each frame and object a range that holds what is covered and ``margin`` more on both sides [px], where the picture has
+    that; all of the same length, in steps of 32 px."""
+    full, seen = covered.shape[2], covered.any(2)
+    first = np.where(seen, covered.argmax(2) - margin, 0)
+    last = np.where(seen, full - covered[..., ::-1].argmax(2) + margin, 1)
     length = min(-(-int((last - first).max()) // 32) * 32, full)
-    return [slice(k, k + length) for k in np.clip(first, 0, full - length).tolist()]
-
-
-def _around(inside: np.ndarray, margin: int) -> slice:
-    """Pixels [px] around the samples of a line that are inside; what lies farther off changes nothing."""
-    found = np.nonzero(inside)[0] // FINE
-    return slice(max(int(found[0]) - margin, 0), min(int(found[-1]) + margin + 1, len(inside) // FINE))
+    return [[slice(k, k + length) for k in row] for row in np.clip(first, 0, full - length).tolist()]
 
 
 def _signed_distance(inside: np.ndarray) -> np.ndarray:
