@@ -1,0 +1,111 @@
+"""Objects that do not meet are moved in the same rollouts, and derivatives stay what they are."""
+
+import numpy as np
+import pytest
+
+from mjx_refine.diagnosis import apart
+from mjx_refine.diagnosis.apart import beside, companies, meetings, moved_together
+from mjx_refine.diagnosis.hypothesis import Hypothesis, term
+from mjx_refine.effects.magnus import Magnus
+from mjx_refine.scene import Body, Camera, Scene
+from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.space import Space
+
+
+def path(*places):
+    """Poses of bodies whose centres are at these places, frame by frame."""
+    centres = np.array(places, np.float64)
+    return np.concatenate([centres, np.tile([1.0, 0.0, 0.0, 0.0], (*centres.shape[:2], 1))], -1)[None]
+
+
+def test_spheres_meet_in_a_frame_or_between_two():
+    away = path([[0, 0, 1], [3, 0, 1], [0, 9, 1]], [[0, 0, 1], [1.0, 0, 1], [0, 9, 1]])
+    past = path([[0, 0, 1], [-3, 0.5, 1], [0, 9, 1]], [[0, 0, 1], [3, 0.5, 1], [0, 9, 1]])
+    radius = np.full((1, 3), 0.4)
+    assert not meetings(away, radius).any()
+    met = meetings(past, radius)
+    assert met.tolist() == (~np.eye(3, dtype=bool) & (np.arange(3) < 2) & (np.arange(3)[:, None] < 2)).tolist()
+    assert meetings(away, np.full((1, 3), 0.6))[0, 1]
+
+
+def test_one_frame_and_diverged_paths_can_be_asked():
+    assert not meetings(path([[0, 0, 1], [3, 0, 1]]), np.full((1, 2), 0.4)).any()
+    assert not meetings(np.full((1, 3, 2, 7), np.nan), np.full((1, 2), 0.4)).any()
+
+
+def test_who_meets_a_third_is_of_one_company():
+    met = np.zeros((4, 4), bool)
+    met[0, 2] = met[2, 0] = met[2, 3] = met[3, 2] = True
+    company = companies(met)
+    assert company[0] == company[2] == company[3] != company[1]
+
+
+def test_every_coordinate_is_moved_once_and_companies_never_twice_in_a_row():
+    owner = np.array([-1, 0, 0, 0, 1, 1, 2, -1])
+    moves = np.array([1, 0, 1, 1, 1, 0, 1, 0], bool)
+    rows = moved_together(owner, np.array([0, 1, 1]), moves)
+    assert (rows.sum(0) == 1).all()
+    assert len(rows) == 2 + 3
+    for row in rows:
+        owners = [min(o, 1) for o in owner[row]]
+        assert len(owners) == len(set(owners))
+    # What moves goes with what moves.
+    assert sum((row & moves).any() for row in rows) == 1 + 2
+
+
+def scene(distance: float) -> Scene:
+    bodies = [
+        Body("box", "left", (0.1, 0.12, 0.14), (0.0, 0.0, 0.3), linear_velocity=(0.3, 0.0, 0.5)),
+        Body("sphere", "right", (0.15,), (distance, 0.1, 0.5), linear_velocity=(-0.2, 0.0, 0.0)),
+    ]
+    return Scene(tuple(bodies), Camera((0.0, -3.0, 1.5), 20.0, 45.0))
+
+
+@pytest.mark.parametrize(("distance", "fewer"), [(1.5, True), (0.35, False)])
+def test_rollouts_are_shared_only_where_objects_do_not_meet(distance, fewer):
+    one = scene(distance)
+    hypothesis = Hypothesis(Space.around(one)).added(term("magnus", 0, 12))
+    simulator, asked = MujocoSimulator(one.shapes, 30.0, 1), []
+
+    def poses_of(points):
+        asked.append(len(points))
+        return simulator.rollout(hypothesis.batch(points), 12)
+
+    z, step = np.zeros(hypothesis.dimension), np.full(hypothesis.dimension, 0.01)
+    told = beside(hypothesis, z, step, poses_of)
+    assert (len(told.points) < hypothesis.dimension) == fewer
+    for k in range(hypothesis.dimension):
+        alone = z.copy()
+        alone[k] += step[k]
+        wanted = simulator.rollout(hypothesis.batch(alone[None]), 12)[0]
+        found = np.where(told.felt[k, :2, None], told.poses[told.row[k]], told.poses[0])
+        assert found == pytest.approx(wanted, abs=1e-9)
+
+
+def test_effects_that_couple_objects_keep_rollouts_apart(monkeypatch):
+    one = scene(1.5)
+    hypothesis = Hypothesis(Space.around(one)).added(term("magnus", 0, 12))
+    simulator = MujocoSimulator(one.shapes, 30.0, 1)
+    monkeypatch.setattr(Magnus, "couples", True)
+    z = np.zeros(hypothesis.dimension)
+    told = beside(hypothesis, z, z + 0.01, lambda points: simulator.rollout(hypothesis.batch(points), 12))
+    assert len(told.points) == 1 + hypothesis.dimension
+    assert told.felt.all()
+
+
+def test_where_a_moved_object_meets_another_rollouts_are_made_again(monkeypatch):
+    one = scene(1.5)
+    hypothesis = Hypothesis(Space.around(one))
+    simulator, asked = MujocoSimulator(one.shapes, 30.0, 1), []
+
+    def poses_of(points):
+        asked.append(len(points))
+        return simulator.rollout(hypothesis.batch(points), 12)
+
+    told = iter([np.zeros((2, 2), bool), ~np.eye(2, dtype=bool)])
+    monkeypatch.setattr(apart, "meetings", lambda poses, radius: next(told))
+    z = np.zeros(hypothesis.dimension)
+    found = beside(hypothesis, z, z + 0.01, poses_of)
+    assert len(asked) == 3
+    assert found.felt.all()
+    assert len(found.points) == 1 + hypothesis.dimension
