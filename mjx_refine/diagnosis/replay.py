@@ -11,6 +11,7 @@ from mjx_refine.diagnosis.hypothesis import Hypothesis, Term
 from mjx_refine.diagnosis.noise import everywhere
 from mjx_refine.scene import Scene
 from mjx_refine.search.problem import Problem
+from mjx_refine.view.effects import needs_pictures
 
 ITERATIONS = 8
 """Of least squares: it begins where the fit with erring contacts ended."""
@@ -56,12 +57,11 @@ def _replay(clip: ClipFit, fit: Fit, rigid: np.ndarray, problem: Problem, matchi
     here, given = fit.z[: held.dimension], np.zeros(held.dimension)
     scenes = [held.scene(z, clip.frames) for z in (rigid, here, given)]
     # To draw every picture takes seconds a scene: which is best is seen in small ones.
-    drawn = any(t.kind.drawn for t in held.terms)
-    scores = problem.score(scenes, matching, COARSE if drawn else None)
+    drawn = needs_pictures(held.batch(rigid[None]))
+    scores = problem.score(scenes, matching, COARSE) if drawn else problem.score(scenes, matching)
     best = int(np.argmax(np.nan_to_num(scores.fitness, nan=-np.inf)))
     if drawn:
-        scores = problem.score([scenes[best]], matching)
-        return Replay(scenes[best], float(scores.iou[0]), float(scores.epe[0]))
+        scores, best, scenes = problem.score([scenes[best]], matching), 0, [scenes[best]]
     return Replay(scenes[best], float(scores.iou[best]), float(scores.epe[best]))
 
 

@@ -13,7 +13,7 @@ from mjx_refine.diagnosis import diagnose
 from mjx_refine.diagnosis.diagnose import prepared
 from mjx_refine.diagnosis.fit import ClipFit
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.replay import replays
+from mjx_refine.diagnosis.replay import COARSE, replays
 from mjx_refine.diagnosis.search import compare
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Effect, Scene
@@ -54,6 +54,23 @@ def test_replays_are_no_worse_than_the_given_scene_and_hold_effects():
     assert scores.fitness[2] >= scores.fitness[:2].max()
     assert (found.iou, found.epe) == pytest.approx((scores.iou[2], scores.epe[2]))
     assert fit_of.slack_columns.shape[1] == 0
+
+
+def test_scenes_whose_every_picture_is_drawn_are_compared_in_small_ones(monkeypatch):
+    clip = clip_of(dataclasses.replace(BOUNCE, effects=(Effect("mask_bias", None, (("width", -2.0),)),)))
+    problem, start, fit_of = started(aside(BOUNCE, 0.02), clip)
+    hypothesis = Hypothesis(Space.around(start.scene), (term("mask_bias", -1, clip.length),))
+    fit = fit_of.at(hypothesis, np.where(hypothesis.ordinary, 0.5, -1.0))
+    asked, score = [], problem.score
+    monkeypatch.setattr(
+        problem, "score", lambda scenes, *rest: asked.append((len(scenes), *rest[1:])) or score(scenes, *rest)
+    )
+    (found,) = replays(fit_of, [fit], problem, start.matching)
+    assert asked == [(3, COARSE), (1,)]
+    scores = score([found.scene], start.matching)
+    assert (found.iou, found.epe) == pytest.approx((scores.iou[0], scores.epe[0]))
+    # Least squares of the base parameters went on with masks as thin as they are.
+    assert found.iou > float(score([hypothesis.scene(fit.z, clip.length)], start.matching).iou[0])
 
 
 def test_the_base_model_is_shown_no_worse_than_it_was_given():
