@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
-from mjx_refine.batch import SceneBatch
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.sim.model import model_fields
 
@@ -54,10 +53,10 @@ def beside(
     if len(rows) < len(z) and (company != companies(met)).any():
         rows = moved_together(hypothesis.owners, np.zeros_like(company), hypothesis.moves)
         points, poses = _rolled(hypothesis, z, rows * step, still, poses_of)
-    owner = hypothesis.owners
-    several = rows.sum(1)[rows.argmax(0)] > 1
-    felt = ~several[:, None] | (company[owner][:, None] == np.append(company, -1))
-    return Beside(np.concatenate([z[None], points]), np.concatenate([still, poses]), 1 + rows.argmax(0), felt)
+    row = rows.argmax(0)
+    alone = rows.sum(1)[row] == 1
+    felt = alone[:, None] | (company[hypothesis.owners][:, None] == np.append(company, -1))
+    return Beside(np.concatenate([z[None], points]), np.concatenate([still, poses]), 1 + row, felt)
 
 
 def _rolled(hypothesis: Hypothesis, z: np.ndarray, steps: np.ndarray, still: np.ndarray, poses_of):
@@ -69,8 +68,7 @@ def _rolled(hypothesis: Hypothesis, z: np.ndarray, steps: np.ndarray, still: np.
 
 
 def _meetings(hypothesis: Hypothesis, points: np.ndarray, poses: np.ndarray) -> Bool[np.ndarray, "objects objects"]:
-    batch: SceneBatch = hypothesis.batch(points)
-    return meetings(poses, model_fields(batch).geom_rbound)
+    return meetings(poses, model_fields(hypothesis.batch(points)).geom_rbound)
 
 
 def meetings(

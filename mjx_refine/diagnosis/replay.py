@@ -58,7 +58,7 @@ def _replay(clip: ClipFit, fit: Fit, rigid: np.ndarray, problem: Problem, matchi
     scenes = [held.scene(z, clip.frames) for z in (rigid, here, given)]
     # To draw every picture takes seconds a scene: which is best is seen in small ones.
     drawn = needs_pictures(held.batch(rigid[None]))
-    scores = problem.score(scenes, matching, COARSE) if drawn else problem.score(scenes, matching)
+    scores = problem.score(scenes, matching, COARSE if drawn else None)
     best = int(np.argmax(np.nan_to_num(scores.fitness, nan=-np.inf)))
     if drawn:
         scores, best, scenes = problem.score([scenes[best]], matching), 0, [scenes[best]]
