@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import jax
 
@@ -17,6 +19,13 @@ log = logging.getLogger("mjx_refine")
 
 VARIABLE = "MJX_REFINE_CACHE"
 """Environment variable that names the cache folder; ``off`` turns the caches off."""
+
+QUICK: dict[str, bool | int] = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_llvm_disable_expensive_passes": True,
+    "xla_backend_optimization_level": 1,
+}
+"""How XLA compiles ``jit_quickly``'s programs on a CPU."""
 
 _KERNELS: dict[str, str] = {}
 
@@ -74,3 +83,37 @@ def compiling(what: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
     log.info("compiled %s in %.1f s", what, time.perf_counter() - start)
+
+
+def jit_quickly(function: Callable, static_argnums: int | tuple[int, ...] = ()) -> Callable:
+    """``jax.jit`` of a program of many small operations that is called by itself, not inside another.
+
+    On a CPU, XLA's fusion emitters and LLVM's dear passes take most of the seconds that such a program needs to be compiled, and
+    it runs no faster for them: outlines and flow of a box and a cylinder compile in a fifth of the time, and run in half of it.
+    """
+    plain = jax.jit(function, static_argnums=static_argnums)
+    quick = jax.jit(function, static_argnums=static_argnums, compiler_options=QUICK)
+
+    @functools.wraps(function)
+    def call(*arguments: Any) -> Any:
+        return (quick if _on_a_cpu() and _knows_quick() else plain)(*arguments)
+
+    return call
+
+
+def _on_a_cpu() -> bool:
+    device = jax.config.jax_default_device
+    if device is None:
+        return jax.default_backend() == "cpu"
+    return (device if isinstance(device, str) else device.platform) == "cpu"
+
+
+@functools.cache
+def _knows_quick() -> bool:
+    """Whether this version of XLA has all of ``QUICK``; they are not what JAX promises to keep."""
+    try:
+        jax.jit(lambda x: x, compiler_options=QUICK).lower(0.0).compile()
+    except Exception as error:  # jaxlib's own kind, which is not public
+        log.debug("programs are compiled as XLA does by default (%s)", error)
+        return False
+    return True

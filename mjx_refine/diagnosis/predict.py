@@ -12,6 +12,7 @@ import scipy.special
 from jaxtyping import Float, Int
 
 from mjx_refine.batch import SceneBatch
+from mjx_refine.compile_cache import jit_quickly
 from mjx_refine.diagnosis.measure import Parts
 from mjx_refine.effects import acting
 from mjx_refine.effects.kind import OutlineView
@@ -61,7 +62,7 @@ def _plain_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int,
     return jnp.stack([support_of(shape, placed, n, normals) for n, shape in enumerate(shapes)], 2) + middle
 
 
-@functools.partial(jax.jit, static_argnums=(0, 3, 4))
+@functools.partial(jit_quickly, static_argnums=(0, 3, 4))
 def _predict(shapes, arrays, pixels, image, count: int):
     """``count``: directions in which effects change outlines; 0 where none does."""
     told = outline_function(shapes, arrays, image, count) if count else (_plain_function(shapes, arrays, image),)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_refine.batch import SceneBatch
+from mjx_refine.compile_cache import jit_quickly
 from mjx_refine.scene import Shape
 from mjx_refine.view.distance import surface
 from mjx_refine.view.frames import make_frames
@@ -41,7 +41,7 @@ def point_flow_function(
     return jnp.stack(result, 1).reshape(batch, length, len(shapes), -1, 2)
 
 
-_point_flow = jax.jit(point_flow_function, static_argnums=(0, 3))
+_point_flow = jit_quickly(point_flow_function, static_argnums=(0, 3))
 
 
 def point_flow(

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.batch import SceneBatch
+from mjx_refine.compile_cache import jit_quickly
 from mjx_refine.effects import acting
 from mjx_refine.effects.kind import OutlineView
 from mjx_refine.scene import Shape
@@ -49,7 +50,7 @@ def outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int
     return jnp.stack(reach, 2) + middle, jnp.stack(contact, 2), jnp.stack(facing, 2), jnp.stack(scale, 2)
 
 
-_outline = jax.jit(outline_function, static_argnums=(0, 2, 3))
+_outline = jit_quickly(outline_function, static_argnums=(0, 2, 3))
 
 
 def changed_moments(
