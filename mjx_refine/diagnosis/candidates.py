@@ -6,9 +6,12 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+import numpy as np
+
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.fitted import Explained
 from mjx_refine.diagnosis.slack import impacts
+from mjx_refine.effects.free_force import KNOTS
 from mjx_refine.effects.hidden_obstacle import gaps
 
 DOUBT = {"friction_patch": 30.0}
@@ -49,6 +52,32 @@ class Candidate(Explained):
 
 
 @dataclasses.dataclass(frozen=True)
+class Freed:
+    """A free force fitted together with the base parameters.
+
+    Attributes:
+      fit: where it ended.
+      on_floor: part of the frames in which the object that it acts on touches the floor.
+    """
+
+    fit: Fit
+    on_floor: float
+
+    @property
+    def target(self) -> int:
+        """Index of the object."""
+        return self.fit.hypothesis.terms[-1].target
+
+    @property
+    def words(self) -> str:
+        """The force's course."""
+        values = self.fit.hypothesis.values(self.fit.z[None], len(self.fit.hypothesis.terms) - 1)[0]
+        times, force = np.linspace(0.0, values[0], KNOTS), values[1:].reshape(3, KNOTS).T
+        rows = zip(times, force, strict=True)
+        return "; ".join(f"({', '.join(f'{part:.2g}' for part in row)}) N at {time:.2g} s" for time, row in rows)
+
+
+@dataclasses.dataclass(frozen=True)
 class Compared:
     """All hypotheses of one clip.
 
@@ -57,12 +86,14 @@ class Compared:
       candidates: single effects, the best evidence first.
       pairs: two effects, the best evidence first.
       impacts: how many impacts were allowed slack.
+      freed: a force of any course, where that was asked for.
     """
 
     base: Fit
     candidates: tuple[Candidate, ...]
     pairs: tuple[Candidate, ...]
     impacts: int
+    freed: Freed | None = None
 
 
 class Weighed(Protocol):

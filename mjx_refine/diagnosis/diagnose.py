@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from mjx_refine.children import cores
 from mjx_refine.compile_cache import enable_cache
-from mjx_refine.diagnosis.candidates import Candidate, Compared
+from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared
 from mjx_refine.diagnosis.crew import Crew, crew_of
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import HeldOut, held_out
@@ -24,8 +24,10 @@ from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Value, 
 from mjx_refine.diagnosis.search import compare
 from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.diagnosis.store import Store
-from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, map_of, signs, upheld
+from mjx_refine.diagnosis.unnamed import freely_forced
+from mjx_refine.diagnosis.verdict import MOSTLY, NAMED, Answer, Signs, answer, best_candidate, map_of, signs, upheld
 from mjx_refine.diagnosis.where import describe, misfit_map, places
+from mjx_refine.effects.kind import FitView
 from mjx_refine.errors import InputError
 from mjx_refine.linear_algebra import one_thread
 from mjx_refine.observation import Observation
@@ -44,6 +46,9 @@ LEAST_MOTION = 1.0
 
 TIED = 0.95
 """Correlation of two numbers of an effect from which a note says so."""
+
+TO_THE_NOISE = 1.5
+"""Gap, over what noise alone leaves, up to which the base model is said to explain a clip."""
 
 TOLD_APART = 0.15
 """Share of the named effects' probability from which an effect is not told apart from the likeliest."""
@@ -97,6 +102,15 @@ def _diagnosed(
 
     best = best_candidate(compared)
     outside = outside_of(best.fit if best else None)
+
+    def shown(fit: Fit) -> FitView:
+        return view_of(clip, fit, observation, start.matching, hidden=False)
+
+    aloft = (shown(compared.base).on_floor.mean(0) < MOSTLY).any()
+    if aloft or (best is not None and best.lead > NAMED * max(clip.misfit(best.fit), LEAST_UNIT)):
+        told("a force without a name")
+        freed = freely_forced(clip, compared, best.fit if best else compared.base, shown)
+        compared = dataclasses.replace(compared, freed=freed)
     found = signs(clip, compared, outside.gain, outside.closed)
     leads = [c.lead for c in compared.candidates]
     said = upheld(answer(found, leads, video=True), compared, lambda fit: outside_of(fit).closed)
@@ -152,14 +166,23 @@ def _check_motion(reach: np.ndarray, observation: Observation) -> None:
 # --- the answer -------------------------------------------------------------------------------------------------------
 
 
-def verdict_of(compared: Compared, said: Answer, names: tuple[str, ...], shapes) -> tuple[Verdict, Candidate | None]:
-    """The likeliest answer, and the hypothesis behind it."""
+def verdict_of(
+    compared: Compared, said: Answer, names: tuple[str, ...], shapes, left: float = 1.0
+) -> tuple[Verdict, Candidate | None]:
+    """The likeliest answer, and the hypothesis behind it; ``left``: the base model's gap over what noise alone leaves."""
     by_name = _by_name(compared, said)
     if said.kind == "none":
         text = "Nothing is seen to be missing: the base model explains the clip to the noise."
+        if left > TO_THE_NOISE:
+            text = (
+                "Nothing is seen to be missing that an effect of the catalogue would explain, though the base model leaves "
+                f"{left:.1f} times what noise does on frames that no fit has seen."
+            )
         return Verdict((), said.probability, (), text, "A longer or faster motion would show smaller effects."), None
     if said.kind == "unknown":
         text = "Something is missing that no effect of the catalogue explains."
+        if said.forced and compared.freed is not None:
+            text = f"Something pushes {names[compared.freed.target]} that no effect of the catalogue describes."
         how = "Film the same motion again: does the misfit come back the same?"
         return Verdict(UNKNOWN, said.probability, (), text, how), None
     top = max(by_name, key=lambda name: by_name[name], default="")
@@ -195,12 +218,12 @@ def _result(
 ) -> Diagnosis:
     base = compared.base
     names, shapes = base.hypothesis.space.scene.names, base.hypothesis.space.scene.shapes
-    verdict, best = verdict_of(compared, said, names, shapes)
+    leading = best_candidate(compared)
+    outside = outside_of(leading.fit if leading else None)
+    left = float(np.sqrt(np.mean(outside.before**2))) / max(outside.floor, 1e-9)
+    verdict, best = verdict_of(compared, said, names, shapes, left)
     shown = best.fit if best else base
-    judged = best or best_candidate(compared)
-    outside = outside_of(judged.fit if judged else None)
-    if best is None:
-        outside = dataclasses.replace(outside, after=outside.before)
+    outside = outside_of(best.fit) if best else dataclasses.replace(outside, after=outside.before)
     view = view_of(clip, shown, observation, matching, hidden=False)
     where = places(clip, base, best.fit if best else None, view)
     candidates = tuple(ranked(clip, compared, said, outside, best))
@@ -224,7 +247,7 @@ def _result(
         map_before=map_before,
         map_after=map_after,
         channels=channels,
-        notes=_notes(clip, compared, matching, names, best),
+        notes=_notes(clip, compared, said, matching, names, best),
         signs=dataclasses.asdict(found),
         seconds=time.monotonic() - began,
         rollouts=int(clip.rollouts),
@@ -348,8 +371,12 @@ def tied(fit: Fit) -> list[str]:
     return told
 
 
-def _notes(clip: ClipFit, compared: Compared, matching, names, best: Candidate | None) -> tuple[str, ...]:
+def _notes(clip: ClipFit, compared: Compared, said: Answer, matching, names, best: Candidate | None) -> tuple[str, ...]:
     notes = [] if best is None else tied(best.fit)
+    if said.forced and (freed := compared.freed) is not None:
+        notes.append(
+            f"A force of any course on {names[freed.target]} explains more than what has a name: (x, y, z) = {freed.words}."
+        )
     lost = [n for n, i in zip(names, matching, strict=True) if i < 0]
     if lost:
         notes.append(f"No mask belongs to {', '.join(lost)}: nothing is known of it.")

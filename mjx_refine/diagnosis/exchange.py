@@ -37,13 +37,14 @@ def exchanged(clip: ClipFit, base: Fit, fitted: Fitted) -> tuple[Fit, Fitted]:
     ordered = sorted(fitted, key=lambda key: -fitted[key][0].evidence)
     count = base.hypothesis.dimension
     sources = [base.z, *(fitted[key][0].z[:count] for key in ordered[:SOURCES])]
-    better = _again(clip, base, sources, count)
+    better = begun_again(clip, base, sources, count)
     takers = ordered[:TAKERS]
-    fits = clip.crew.each(clip, _again, [(fitted[key][0], [better.z, *sources], count) for key in takers])
+    fits = clip.crew.each(clip, begun_again, [(fitted[key][0], [better.z, *sources], count) for key in takers])
     return better, {**fitted, **{key: (fit, fitted[key][1]) for key, fit in zip(takers, fits, strict=True)}}
 
 
-def _again(clip: ClipFit, fit: Fit, sources: list[np.ndarray], count: int) -> Fit:
+def begun_again(clip: ClipFit, fit: Fit, sources: list[np.ndarray], count: int) -> Fit:
+    """The fit, or a better one from base parameters that others found; ``count``: how many these are."""
     own = fit.z[count:]
     points = [np.concatenate([z, part]) for z in sources for part in ([own, 0 * own] if len(own) else [own])]
     points = np.array([point for point in points if not np.array_equal(point, fit.z)])

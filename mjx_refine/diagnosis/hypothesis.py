@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mjx_refine.batch import BatchEffect, SceneBatch, scene_from_batch
-from mjx_refine.effects import EffectKind, effect_entry, kind_of
+from mjx_refine.effects import EffectKind, acting_kind, effect_entry
 from mjx_refine.effects.acting import on_the_floor
 from mjx_refine.scene import Effect, Scene
 from mjx_refine.space import Space
@@ -50,12 +50,12 @@ class Term:
 
     @property
     def kind(self) -> EffectKind:
-        return kind_of(self.name)
+        return acting_kind(self.name)
 
 
 def term(name: str, target: int, frames: int, start: np.ndarray | None = None, **changes) -> Term:
     """A term around its kind's prior, or around ``start`` where that is given."""
-    kind = kind_of(name)
+    kind = acting_kind(name)
     rows = kind.spread(frames)
     centre = np.array([p.centre for p in rows]) if start is None else np.asarray(start, np.float64)
     one = Term(

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from mjx_refine import rotations
 from mjx_refine.batch import BatchEffect, SceneBatch, batch_from_scenes
 from mjx_refine.effects.kind import EffectKind, Loads, Motion, OutlineView
-from mjx_refine.effects.registry import kind_of
+from mjx_refine.effects.registry import acting_kind, kind_of
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Effect, Scene
 
@@ -73,7 +73,7 @@ def effect_entry(kind: EffectKind, target: str | None, values: Float[np.ndarray,
 
 def _acting(batch: SceneBatch) -> Iterator[tuple[EffectKind, BatchEffect]]:
     for effect in batch.effects:
-        yield kind_of(effect.name), effect
+        yield acting_kind(effect.name), effect
 
 
 def is_physical(batch: SceneBatch) -> bool:

@@ -10,6 +10,7 @@ from mjx_refine.effects.camera_roll import CameraRoll
 from mjx_refine.effects.camera_shake import CameraShake
 from mjx_refine.effects.drag import Drag
 from mjx_refine.effects.dropped_frames import DroppedFrames
+from mjx_refine.effects.free_force import FreeForce
 from mjx_refine.effects.friction_patch import FrictionPatch
 from mjx_refine.effects.hidden_obstacle import HiddenObstacle
 from mjx_refine.effects.kind import EffectKind
@@ -80,3 +81,11 @@ def kind_of(name: str, place: str = "effect") -> EffectKind:
     if name not in kinds:
         raise InputError(f"{place} = {name!r}; expected one of {', '.join(kinds)}; correct the name")
     return kinds[name]
+
+
+_UNNAMED: dict[str, EffectKind] = {FreeForce.name: FreeForce()}
+
+
+def acting_kind(name: str) -> EffectKind:
+    """The kind called ``name``, of the catalogue or of those that only a diagnosis compares with and no scene file holds."""
+    return _UNNAMED[name] if name in _UNNAMED else kind_of(name)

@@ -17,7 +17,7 @@ from mjx_refine.batch import BatchEffect, SceneBatch
 from mjx_refine.effects import acting
 from mjx_refine.effects.kind import EffectKind
 from mjx_refine.effects.mask_bias import width_change
-from mjx_refine.effects.registry import kind_of
+from mjx_refine.effects.registry import acting_kind
 from mjx_refine.view.exposure import poses_at, straightened
 from mjx_refine.view.outline import supports
 from mjx_refine.view.picture import draw
@@ -60,9 +60,9 @@ class Layers:
 
 def layers(batch: SceneBatch) -> Layers:
     """How the effects of ``batch`` are drawn."""
-    bends = {e.name for e in batch.effects if type(kind_of(e.name)).warp is not EffectKind.warp}
+    bends = {e.name for e in batch.effects if type(acting_kind(e.name)).warp is not EffectKind.warp}
     special = {_RECTANGLE, _WIDTH, "rolling_shutter", *bends}
-    outlines = [e for e in batch.effects if type(kind_of(e.name)).outline is not EffectKind.outline]
+    outlines = [e for e in batch.effects if type(acting_kind(e.name)).outline is not EffectKind.outline]
     widths = [e.values[:, 0] for e in batch.effects if e.name == _WIDTH]
     readouts = [e.values[:, 0] for e in batch.effects if e.name == "rolling_shutter"]
     return Layers(

@@ -97,7 +97,7 @@ def test_what_the_background_shows_counts_whatever_effect_leads_a_little(monkeyp
     clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0)
     base = SimpleNamespace(data=400.0)
     one = SimpleNamespace(fit=base, lead=22.0, names=("slope",))
-    told = signs(clip, SimpleNamespace(base=base, candidates=(one,), pairs=()), 0.0)
+    told = signs(clip, SimpleNamespace(base=base, candidates=(one,), pairs=(), freed=None), 0.0)
     assert told.whole == pytest.approx(8.0)
     assert answer(told, [22.0]).kind == "unknown"
 
@@ -113,7 +113,7 @@ def test_two_effects_are_beside_each_other_where_one_of_them_moves_the_camera(mo
         )
 
     def beside(*names):
-        found = SimpleNamespace(base=fitted().fit, candidates=(fitted(names[0]),), pairs=(fitted(*names),))
+        found = SimpleNamespace(base=fitted().fit, candidates=(fitted(names[0]),), pairs=(fitted(*names),), freed=None)
         return signs(clip, found, 0.0).beside
 
     assert beside("push", "camera_motion") == beside("camera_shake", "drag") == 1.0

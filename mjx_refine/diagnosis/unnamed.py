@@ -1,0 +1,64 @@
+"""What the catalogue does not hold: a force of any course, fitted beside the effects that have names.
+
+Of a drag that has been left out of the catalogue a push explains much, and what it leaves is little more than noise. A force that
+may change as it likes explains more than that push, by more than its numbers cost in evidence; of a push it explains less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mjx_refine.diagnosis.candidates import Compared, Freed
+from mjx_refine.diagnosis.exchange import NEAR, SOURCES, begun_again
+from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
+from mjx_refine.diagnosis.leads import beginning
+from mjx_refine.diagnosis.screen import Lead, Screen
+from mjx_refine.effects.free_force import FreeForce
+from mjx_refine.effects.kind import FitView
+
+FORGIVING, FIRST, ITERATIONS = 40.0, 7, 14
+"""Scale of the robust loss with which the first steps are made where the effect's own numbers are left out [noise widths], how
+many these are, and how many follow."""
+
+
+def freely_forced(clip: ClipFit, compared: Compared, best: Fit, shown: Callable[[Fit], FitView]) -> Freed:
+    """The force without a name that explains a clip best.
+
+    Args:
+      clip: residuals.
+      compared: the hypotheses with names.
+      best: of them, or the base model's: where its base parameters are the force begins as well.
+      shown: what a fit's rollout shows.
+    """
+    base = compared.base
+    looks = [(base, shown(base), SCALE)]
+    if best is not base:
+        bare = clip.at(base.hypothesis, best.z[: base.hypothesis.dimension], scale=FORGIVING)
+        looks.append((bare, shown(bare), FORGIVING))
+    leads = clip.crew.each(clip, _best_lead, looks)
+    count = base.hypothesis.dimension
+    others = [base.z, *(one.fit.z[:count] for one in (*compared.candidates[:SOURCES], *compared.pairs[:1]))]
+    rows = [(here, lead, scale, best.cost, others) for (here, _, scale), lead in zip(looks, leads, strict=True)]
+    fits = clip.crew.each(clip, _fitted, rows)
+    fit = max(fits, key=lambda one: one.evidence)
+    target = fit.hypothesis.terms[-1].target
+    return Freed(fit, float(looks[0][1].on_floor[:, target].mean()))
+
+
+def _best_lead(clip: ClipFit, here: Fit, view: FitView, scale: float) -> Lead:
+    """Of all objects."""
+    kind, look = FreeForce(), Screen(clip, here, view, scale)
+    leads = [look.looked(kind, target, kind.starts(view, target))[0] for target in range(len(view.batch.shapes))]
+    return max(leads, key=lambda lead: lead.gain)
+
+
+def _fitted(clip: ClipFit, here: Fit, lead: Lead, scale: float, rival: float, others: list[np.ndarray]) -> Fit:
+    one = lead.term(clip.frames)
+    hypothesis = here.hypothesis.added(one)
+    z = beginning(clip, hypothesis, here, lead, lead.z(one))
+    if scale > SCALE:
+        z = clip.fit(hypothesis, z, FIRST, scale=scale).z
+    fit = clip.fit(hypothesis, z, ITERATIONS, rival=rival)
+    return begun_again(clip, fit, others, here.hypothesis.dimension) if fit.cost < NEAR * rival else fit
