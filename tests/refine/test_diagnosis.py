@@ -120,6 +120,20 @@ def test_two_effects_are_beside_each_other_where_one_of_them_moves_the_camera(mo
     assert beside("push", "drag") == beside("camera_shake", "camera_motion") == 0.0
 
 
+@pytest.mark.parametrize(
+    ("name", "behind", "sure"),
+    [("mask_bias", 150.0, 1.0), ("mask_bias", 350.0, 0.0), ("dropped_frames", 150.0, 1.0), ("push", 150.0, 0.0)],
+)
+def test_what_nothing_else_looks_like_is_unmistakable_where_it_leads_by_far(monkeypatch, name, behind, sure):
+    monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
+    clip = SimpleNamespace(misfit=lambda fit: 2.0, expected=lambda: 100.0)
+    base = SimpleNamespace(data=400.0)
+    one, other = (SimpleNamespace(fit=base, lead=lead, names=(n,)) for lead, n in ((400.0, name), (behind, "shape")))
+    assert (
+        signs(clip, SimpleNamespace(base=base, candidates=(one, other), pairs=(), freed=None), 0.0).unmistakable == sure
+    )
+
+
 SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
 
 
@@ -158,6 +172,13 @@ SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
         ({"closed": 0.3}, "single"),
         ({"closed": 0.05, "held_out": 20.0, "inimitable": 1.0}, "unknown"),
         ({"after": 2.2}, "unknown"),
+        ({"after": 2.2, "unmistakable": 1.0}, "single"),
+        ({"structure_after": 9.0, "unmistakable": 1.0}, "single"),
+        ({"structure_first": 9.0, "unmistakable": 1.0}, "single"),
+        ({"closed": 0.2, "unmistakable": 1.0}, "single"),
+        ({"closed": 0.05, "unmistakable": 1.0}, "unknown"),
+        ({"pair": 200.0, "structure_after": 9.0, "unmistakable": 1.0}, "unknown"),
+        ({"lead": 20.0, "after": 2.2, "unmistakable": 1.0}, "unknown"),
         ({"pair": 200.0, "structure_after": 9.0, "structure_first": 90.0}, "unknown"),
         ({"after": 5.0}, "unknown"),
         ({"lead": 20.0, "after": 2.1}, "unknown"),
