@@ -117,7 +117,9 @@ def test_two_effects_are_beside_each_other_where_one_of_them_moves_the_camera(mo
         return signs(clip, found, 0.0).beside
 
     assert beside("push", "camera_motion") == beside("camera_shake", "drag") == 1.0
-    assert beside("push", "drag") == beside("camera_shake", "camera_motion") == 0.0
+    assert (
+        beside("push", "drag") == beside("camera_shake", "camera_motion") == beside("camera_motion", "mask_bias") == 0.0
+    )
 
 
 @pytest.mark.parametrize(
@@ -162,7 +164,8 @@ SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
         ({"lead": 50.0, "structure_before": 1.9, "inimitable": 1.0}, "single"),
         ({"lead": 35.0, "structure_before": 9.0, "inimitable": 1.0}, "none"),
         ({"lead": 3000.0, "pair": 200.0, "beside": 1.0}, "pair"),
-        ({"lead": 30000.0, "pair": 200.0, "beside": 1.0}, "single"),
+        ({"lead": 30000.0, "pair": 90.0, "beside": 1.0}, "pair"),
+        ({"lead": 30000.0, "pair": 70.0, "beside": 1.0}, "single"),
         ({"pair": 200.0, "structure_after": 1.6, "closed": 0.7}, "unknown"),
         ({"pair": 200.0, "structure_after": 1.6, "closed": 0.9}, "pair"),
         ({"pair": 200.0, "structure_after": 2.1, "closed": 0.9}, "unknown"),
