@@ -222,7 +222,7 @@ class Answer:
       probability: that it is right.
       shares: of each candidate (by its index) if the catalogue holds what is missing.
       at_work: that the best single effect is at work, alone or with others.
-      forced: whether it is ``unknown`` because a force of any course explains more.
+      forced: whether it is ``unknown`` and a force of any course explains more than what has a name.
     """
 
     kind: str
@@ -255,11 +255,21 @@ def answer(told: Signs, leads: list[float], video: bool = False) -> Answer:
     """
     weights = SHARPNESS * (np.array(leads) - max(leads)) / max(told.after, 0.3) if leads else np.zeros(0)
     shares = tuple(float(w) for w in np.exp(weights) / np.exp(weights).sum()) if leads else ()
+    said = _answered(told, shares, video)
+    return dataclasses.replace(said, forced=said.kind == "unknown" and video and _forced(told))
+
+
+def _forced(told: Signs) -> bool:
+    """Whether a force of any course explains more than the best hypothesis."""
+    return told.unnamed > (UNNAMED if told.aloft else UNNAMED_ON_THE_FLOOR)
+
+
+def _answered(told: Signs, shares: tuple[float, ...], video: bool) -> Answer:
     if _slight(told, video):
         if told.structure_after > ODD or told.whole > RESTLESS or (video and told.after > FAR_OFF):
             return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
         if video and told.aloft and told.unnamed > NAMED:
-            return Answer("unknown", LIKELY, shares, AT_WORK["unknown"], forced=True)
+            return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
         if told.held_out > UNSEEN:
             return Answer("none", UNLIKELY, shares, AT_WORK["perhaps none"])
         return Answer("none", LIKELY, shares, AT_WORK["none"])
@@ -267,8 +277,8 @@ def answer(told: Signs, leads: list[float], video: bool = False) -> Answer:
     sure = video and bool(told.unmistakable)
     if bends or (video and told.after > FAR_OFF and not sure):
         return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
-    if video and not sure and told.unnamed > (UNNAMED if told.aloft else UNNAMED_ON_THE_FLOOR):
-        return Answer("unknown", LIKELY, shares, AT_WORK["unknown"], forced=True)
+    if video and not sure and _forced(told):
+        return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
     paired = _paired(told, video)
     # Where one effect is named, what it leaves by itself counts.
     alone = video and not paired and not told.inimitable and not sure

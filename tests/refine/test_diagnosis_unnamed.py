@@ -74,6 +74,8 @@ def test_no_scene_and_no_call_may_name_it():
         ({"lead": 20.0, "unnamed": NAMED + 1, "aloft": 1.0}, "unknown", True),
         ({"lead": 20.0, "unnamed": NAMED - 1, "aloft": 1.0}, "none", False),
         ({"lead": 20.0, "unnamed": NAMED + 1}, "none", False),
+        ({"closed": 0.05, "unnamed": UNNAMED + 1, "aloft": 1.0}, "unknown", True),
+        ({"closed": 0.05, "unnamed": UNNAMED - 1, "aloft": 1.0}, "unknown", False),
     ],
 )
 def test_what_explains_more_without_a_name_is_unknown(changes, kind, forced):
