@@ -180,7 +180,8 @@ SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
         ({"structure_first": 9.0, "unmistakable": 1.0}, "single"),
         ({"closed": 0.2, "unmistakable": 1.0}, "single"),
         ({"closed": 0.05, "unmistakable": 1.0}, "unknown"),
-        ({"pair": 200.0, "structure_after": 9.0, "unmistakable": 1.0}, "unknown"),
+        ({"pair": 200.0, "structure_after": 9.0, "unmistakable": 1.0}, "single"),
+        ({"pair": 200.0, "unmistakable": 1.0}, "pair"),
         ({"lead": 20.0, "after": 2.2, "unmistakable": 1.0}, "unknown"),
         ({"pair": 200.0, "structure_after": 9.0, "structure_first": 90.0}, "unknown"),
         ({"after": 5.0}, "unknown"),
@@ -232,18 +233,28 @@ def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, li
 
 
 @pytest.mark.parametrize(
-    ("second", "closed", "kind"), [(310.0, 0.05, "unknown"), (310.0, 0.5, "single"), (290.0, 0.05, "single")]
+    ("second", "closed", "changes", "kind"),
+    [
+        (310.0, 0.05, {}, "unknown"),
+        (310.0, 0.5, {}, "single"),
+        (290.0, 0.05, {}, "single"),
+        (310.0, 0.05, {"inimitable": 1.0}, "single"),
+        (310.0, 0.05, {"inimitable": 1.0, "held_out": 20.0}, "unknown"),
+    ],
 )
-def test_one_effect_of_two_that_lead_must_close_the_gap_alone(second, closed, kind):
+def test_one_effect_of_two_that_lead_must_close_the_gap_alone(second, closed, changes, kind):
+    told = dataclasses.replace(SIGNS, **changes)
     one, two = SimpleNamespace(fit="one", lead=300.0), SimpleNamespace(fit="two", lead=second)
     asked = []
     said = upheld(
-        answer(SIGNS, [300.0, 150.0]),
+        answer(told, [300.0, 150.0]),
         SimpleNamespace(candidates=(one,), pairs=(two,)),
+        told,
         lambda fit: asked.append(fit) or closed,
     )
     assert said.kind == kind
-    assert asked == (["one"] if second > 300.0 else [])
+    # An effect that contacts do not imitate needs not ask where it gains.
+    assert asked == (["one"] if second > 300.0 and not (told.inimitable and told.held_out > 40.0) else [])
 
 
 def test_of_two_named_effects_the_better_one_is_the_surer():

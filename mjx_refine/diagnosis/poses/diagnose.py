@@ -92,7 +92,7 @@ def diagnose_recording(
     outside = held_out(clip, compared.base, best.fit if best else None)
     found = unsettled(signs(clip, compared, outside[0].gain, outside[0].closed), compared)
     said = answer(found, [c.lead for c in compared.candidates])
-    said = upheld(said, compared, lambda fit: held_out(clip, compared.base, fit)[0].closed)
+    said = upheld(said, compared, found, lambda fit: held_out(clip, compared.base, fit)[0].closed)
     told("report")
     diagnosis = _result(clip, compared, outside, found, said, blank, columns, seed, began)
     return _with_plain(diagnosis, first[0], compared.impacts)
