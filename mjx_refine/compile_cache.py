@@ -90,6 +90,7 @@ def jit_quickly(function: Callable, static_argnums: int | tuple[int, ...] = ()) 
 
     On a CPU, XLA's fusion emitters and LLVM's dear passes take most of the seconds that such a program needs to be compiled, and
     it runs no faster for them: outlines and flow of a box and a cylinder compile in a fifth of the time, and run in half of it.
+    Last bits of a row may then depend on how many rows there are.
     """
     plain = jax.jit(function, static_argnums=static_argnums)
     quick = jax.jit(function, static_argnums=static_argnums, compiler_options=QUICK)

@@ -13,8 +13,9 @@ from mjx_refine.diagnosis.screen import term_of
 from mjx_refine.effects.friction_patch import FrictionPatch
 from mjx_refine.effects.kind import FitView
 
-BEGUN, LOOK, ITERATIONS = 4, 5, 12
-"""From how many of the patches fits begin, after how many steps the best of these goes on, and for how long."""
+BEGUN, LOOK, ITERATIONS = 3, 5, 12
+"""From how many of the patches fits begin with either ordinary numbers, after how many steps the best of these goes on, and for
+how long."""
 
 
 def patches_from_pushes(clip: ClipFit, pushes: Sequence[tuple[Fit, FitView]]) -> list[Fit | None]:
@@ -38,16 +39,19 @@ def _crossings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis,
     starts = FrictionPatch().crossed(dataclasses.replace(view, poses=poses), push.target, frame)
     if not starts:
         return []
-    plain, base = fit.ordinary
+    plain, own = fit.ordinary
     terms = [term_of("friction_patch", -1, start, clip.frames) for start in starts]
-    at = [np.concatenate([base[0], (one.centre - terms[0].centre) / terms[0].width]) for one in terms]
-    white, costs = clip.residuals(plain.added(terms[0]), np.array(at))
-    # Without the prior, which is the first one's.
-    left = np.where(np.isfinite(costs), (white**2).sum(1), np.inf)
     nothing = np.zeros(len(terms[0].centre))
-    return [
-        (plain.added(terms[k]), np.concatenate([base[0], nothing])) for k in np.argsort(left, kind="stable")[:BEGUN]
-    ]
+    found = []
+    # A push that ended badly has bent the ordinary numbers, and the given scene's are bent by nothing.
+    for ground in (own[0], np.zeros(plain.dimension)):
+        at = [np.concatenate([ground, (one.centre - terms[0].centre) / terms[0].width]) for one in terms]
+        white, costs = clip.residuals(plain.added(terms[0]), np.array(at))
+        # Without the prior, which is the first one's.
+        left = np.where(np.isfinite(costs), (white**2).sum(1), np.inf)
+        best = np.argsort(left, kind="stable")[:BEGUN]
+        found += [(plain.added(terms[k]), np.concatenate([ground, nothing])) for k in best]
+    return found
 
 
 def _fitted(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray, iterations: int) -> Fit:

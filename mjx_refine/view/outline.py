@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_refine.batch import SceneBatch
-from mjx_refine.compile_cache import jit_quickly
 from mjx_refine.scene import Shape
 from mjx_refine.view.frames import camera_matrix, rotation_matrix
 
@@ -224,7 +223,7 @@ def in_pieces(
     return np.concatenate([np.asarray(part) for part in parts])[: len(poses)]
 
 
-_support_function = jit_quickly(support_function, static_argnums=(0, 2, 3))
+_support_function = jax.jit(support_function, static_argnums=(0, 2, 3))
 
 
 def supports(
