@@ -344,6 +344,8 @@ def test_drag_is_named_and_measured():
     assert first.target == "ball"
     assert found.scene.effects
     assert found.gap.after < found.gap.before
+    # A force of any course has more numbers and explains no more.
+    assert found.signs["unnamed"] < 0
     speed = 2.5
     force = sum(first.parameters[name].value * speed**power for name, power in (("linear", 1), ("quadratic", 2)))
     assert force == pytest.approx(0.5 * speed**2, rel=0.3)

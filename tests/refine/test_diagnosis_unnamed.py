@@ -10,7 +10,7 @@ import pytest
 from effect_scenes import BALL, CAMERA, FPS
 from own_clip import SIZE
 from test_diagnosis import BALL as THROWN
-from test_diagnosis import FLIGHT, SIGNS, clip_of
+from test_diagnosis import FLIGHT, SIGNS
 
 from mjx_refine.batch import BatchEffect, batch_from_scenes
 from mjx_refine.diagnosis import diagnose, verdict
@@ -22,7 +22,7 @@ from mjx_refine.effects import acting_kind, catalogue, kind_of
 from mjx_refine.effects.free_force import KNOTS
 from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation
-from mjx_refine.scene import Effect, Scene
+from mjx_refine.scene import Scene
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.space import Space
 from mjx_refine.view.picture import draw
@@ -119,14 +119,10 @@ def test_a_verdict_says_what_pushes_and_what_is_left():
     assert "2.0 times what noise does" in far
 
 
-def test_a_force_that_turns_round_twice_is_unknown_and_a_push_is_not():
+def test_a_force_that_turns_round_twice_is_unknown():
     given = dataclasses.replace(FLIGHT, objects=(dataclasses.replace(THROWN, linear_velocity=(2.7, 0.3, 2.05)),))
     course = np.outer(np.array([1, 1, -1, -1, -1, 1, 1]) * 12.0 * THROWN.mass, [0.8, 0.0, 0.6])
     strange = diagnose(given, strange_clip(FLIGHT, course), threads=1)
     assert strange.verdict.effects == ("unknown",)
     assert strange.signs["unnamed"] > UNNAMED
     assert any("N at" in note for note in strange.notes)
-    push = Effect("push", "ball", (("time", 0.3), ("x", 0.5 * THROWN.mass), ("y", 0.0), ("z", 0.6 * THROWN.mass)))
-    pushed = diagnose(given, clip_of(dataclasses.replace(FLIGHT, effects=(push,))), threads=1)
-    assert pushed.verdict.effects == ("push",)
-    assert pushed.signs["unnamed"] < 0
