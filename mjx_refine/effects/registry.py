@@ -65,7 +65,7 @@ def catalogue() -> dict[str, EffectKind]:
             raise InputError(f"{place}: does not load ({error}); correct or uninstall the plugin") from error
         if not (isinstance(plugin, type) and issubclass(plugin, EffectKind)):
             raise InputError(f"{place}: got {plugin!r}; expected a subclass of EffectKind; correct the plugin")
-        if plugin.name in kinds:
+        if plugin.name in kinds or plugin.name in _UNNAMED:
             raise InputError(f"{place}: the name {plugin.name!r} is taken; rename the plugin's effect")
         kinds[plugin.name] = plugin()
     return kinds

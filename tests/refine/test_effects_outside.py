@@ -188,9 +188,10 @@ def test_a_broken_plugin_is_named(plugin, value, told):
         catalogue()
 
 
-def test_a_plugin_cannot_take_a_name_of_ours(plugin):
-    plugin(type("Other", (Lift,), {"name": "drag"}))
-    with pytest.raises(InputError, match="'drag' is taken"):
+@pytest.mark.parametrize("name", ["drag", "free_force"])
+def test_a_plugin_cannot_take_a_name_of_ours(plugin, name):
+    plugin(type("Other", (Lift,), {"name": name}))
+    with pytest.raises(InputError, match=f"'{name}' is taken"):
         catalogue()
 
 
