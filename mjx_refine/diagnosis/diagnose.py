@@ -106,10 +106,11 @@ def _diagnosed(
     def shown(fit: Fit) -> FitView:
         return view_of(clip, fit, observation, start.matching, hidden=False)
 
-    aloft = (shown(compared.base).on_floor.mean(0) < MOSTLY).any()
+    seen = shown(compared.base)
+    aloft = (seen.on_floor.mean(0) < MOSTLY).any()
     if aloft or (best is not None and best.lead > NAMED * max(clip.misfit(best.fit), LEAST_UNIT)):
         told("a force without a name")
-        freed = freely_forced(clip, compared, best.fit if best else compared.base, shown)
+        freed = freely_forced(clip, compared, best.fit if best else compared.base, seen, shown)
         compared = dataclasses.replace(compared, freed=freed)
     found = signs(clip, compared, outside.gain, outside.closed)
     leads = [c.lead for c in compared.candidates]

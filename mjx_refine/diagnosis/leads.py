@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.screen import Lead
+
+FORGIVING, FIRST = 40.0, 7
+"""Scale of the robust loss while a fit is far off [noise widths], and steps that are made with it."""
 
 PROMISE = 2.0
 """Evidence that the linear look must promise for a family to be fitted."""
@@ -29,3 +32,11 @@ def beginning(clip: ClipFit, hypothesis: Hypothesis, base: Fit, lead: Lead, z: n
     limited = np.clip(lead.shift, -10.0, 10.0)
     points = [np.concatenate([base.z + a * limited, z if lead.whole else a * z]) for a in parts]
     return clip.best_of(hypothesis, np.array(points))
+
+
+def begun(clip: ClipFit, here: Fit, lead: Lead, scale: float) -> tuple[Hypothesis, np.ndarray]:
+    """A lead's hypothesis and where its fit starts; after some steps with the loss of ``scale``, where that forgives more."""
+    one = lead.term(clip.frames)
+    hypothesis = here.hypothesis.added(one)
+    z = beginning(clip, hypothesis, here, lead, lead.z(one))
+    return hypothesis, clip.fit(hypothesis, z, FIRST, scale=scale).z if scale > SCALE else z

@@ -13,7 +13,7 @@ from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_
 from mjx_refine.diagnosis.exchange import Fitted, Key, alone, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
-from mjx_refine.diagnosis.leads import beginning, chosen_of
+from mjx_refine.diagnosis.leads import FORGIVING, begun, chosen_of
 from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.pairs import Told, pairs_of
 from mjx_refine.diagnosis.patches import patches_from_pushes
@@ -59,9 +59,6 @@ takes off less than half, and a camera that shakes had made twenty times too muc
 
 THIN = 1.0
 """How much too thin masks are from which on those of objects that hide one another do not touch [px]."""
-
-FORGIVING = 40.0
-"""Scale of the robust loss while a fit is far off [noise widths]."""
 
 Row = tuple[Fit, Lead, float]
 """Where a lead was seen, the lead, and the scale of the robust loss with which it was looked for."""
@@ -216,15 +213,13 @@ def _strikes(fit: Fit) -> bool:
 
 def _begun(clip: ClipFit, here: Fit, lead: Lead, scale: float, rival: float) -> Fit:
     """A lead's fit after its first steps."""
-    one = lead.term(clip.frames)
-    hypothesis = here.hypothesis.added(one)
-    z = beginning(clip, hypothesis, here, lead, lead.z(one))
-    if scale > SCALE:
-        z = clip.fit(hypothesis, z, 7, scale=scale).z
+    hypothesis, z = begun(clip, here, lead, scale)
     fit = clip.fit(hypothesis, z, 9, rival=rival, attempts=LOOK)
     if fit.cost > here.cost and scale == SCALE and not lead.whole:
         # Where the linear look misleads, the effect grows from nothing.
-        fit = clip.fit(hypothesis, np.concatenate([here.z, 0 * lead.z(one)]), 9, rival=rival, attempts=LOOK)
+        fit = clip.fit(
+            hypothesis, np.concatenate([here.z, 0 * lead.z(hypothesis.terms[-1])]), 9, rival=rival, attempts=LOOK
+        )
     return fit
 
 

@@ -13,27 +13,29 @@ import numpy as np
 from mjx_refine.diagnosis.candidates import Compared, Freed
 from mjx_refine.diagnosis.exchange import NEAR, SOURCES, begun_again
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
-from mjx_refine.diagnosis.leads import beginning
+from mjx_refine.diagnosis.leads import FORGIVING, begun
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.effects.free_force import FreeForce
 from mjx_refine.effects.kind import FitView
 
-FORGIVING, FIRST, ITERATIONS = 40.0, 7, 14
-"""Scale of the robust loss with which the first steps are made where the effect's own numbers are left out [noise widths], how
-many these are, and how many follow."""
+ITERATIONS = 14
+"""Of least squares."""
 
 
-def freely_forced(clip: ClipFit, compared: Compared, best: Fit, shown: Callable[[Fit], FitView]) -> Freed:
+def freely_forced(
+    clip: ClipFit, compared: Compared, best: Fit, seen: FitView, shown: Callable[[Fit], FitView]
+) -> Freed:
     """The force without a name that explains a clip best.
 
     Args:
       clip: residuals.
       compared: the hypotheses with names.
       best: of them, or the base model's: where its base parameters are the force begins as well.
-      shown: what a fit's rollout shows.
+      seen: what the base model's rollout shows.
+      shown: what a fit's does.
     """
     base = compared.base
-    looks = [(base, shown(base), SCALE)]
+    looks = [(base, seen, SCALE)]
     if best is not base:
         bare = clip.at(base.hypothesis, best.z[: base.hypothesis.dimension], scale=FORGIVING)
         looks.append((bare, shown(bare), FORGIVING))
@@ -44,7 +46,7 @@ def freely_forced(clip: ClipFit, compared: Compared, best: Fit, shown: Callable[
     fits = clip.crew.each(clip, _fitted, rows)
     fit = max(fits, key=lambda one: one.evidence)
     target = fit.hypothesis.terms[-1].target
-    return Freed(fit, float(looks[0][1].on_floor[:, target].mean()))
+    return Freed(fit, float(seen.on_floor[:, target].mean()))
 
 
 def _best_lead(clip: ClipFit, here: Fit, view: FitView, scale: float) -> Lead:
@@ -55,10 +57,6 @@ def _best_lead(clip: ClipFit, here: Fit, view: FitView, scale: float) -> Lead:
 
 
 def _fitted(clip: ClipFit, here: Fit, lead: Lead, scale: float, rival: float, others: list[np.ndarray]) -> Fit:
-    one = lead.term(clip.frames)
-    hypothesis = here.hypothesis.added(one)
-    z = beginning(clip, hypothesis, here, lead, lead.z(one))
-    if scale > SCALE:
-        z = clip.fit(hypothesis, z, FIRST, scale=scale).z
+    hypothesis, z = begun(clip, here, lead, scale)
     fit = clip.fit(hypothesis, z, ITERATIONS, rival=rival)
     return begun_again(clip, fit, others, here.hypothesis.dimension) if fit.cost < NEAR * rival else fit

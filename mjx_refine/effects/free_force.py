@@ -15,7 +15,7 @@ class FreeForce(EffectKind):
 
     It has no name in the catalogue and no place in a scene file: a diagnosis compares its answer with it, and where it explains
     a clip better than an effect with fewer numbers, that effect is not what acts (a spline for a force that is not known:
-    Kennedy & O'Hagan 2001, section 4, have a Gaussian process in that place).
+    Kennedy & O'Hagan 2001 have a Gaussian process in that place).
     """
 
     name = "free_force"
