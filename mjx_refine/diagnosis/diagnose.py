@@ -221,7 +221,9 @@ def _result(
     names, shapes = base.hypothesis.space.scene.names, base.hypothesis.space.scene.shapes
     leading = best_candidate(compared)
     outside = outside_of(leading.fit if leading else None)
-    left = float(np.sqrt(np.mean(outside.before**2))) / max(outside.floor, 1e-9)
+    gap = float(np.sqrt(np.mean(outside.before**2)))
+    # Up to a noise width nothing is above the noise, as the report says of every place.
+    left = gap / max(outside.floor, 1e-9) if gap > 1.0 else 1.0
     verdict, best = verdict_of(compared, said, names, shapes, left)
     shown = best.fit if best else base
     outside = outside_of(best.fit) if best else dataclasses.replace(outside, after=outside.before)
