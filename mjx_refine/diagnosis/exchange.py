@@ -36,25 +36,29 @@ def exchanged(clip: ClipFit, base: Fit, fitted: Fitted) -> tuple[Fit, Fitted]:
     """The base model's fit and the effects' (with what the linear look promised), none worse than before."""
     ordered = sorted(fitted, key=lambda key: -fitted[key][0].evidence)
     count = base.hypothesis.dimension
-    sources = [base.z, *(fitted[key][0].z[:count] for key in ordered[:SOURCES])]
+    sources = [base, *(fitted[key][0] for key in ordered[:SOURCES])]
     better = begun_again(clip, base, sources, count)
     takers = ordered[:TAKERS]
-    fits = clip.crew.each(clip, begun_again, [(fitted[key][0], [better.z, *sources], count) for key in takers])
+    fits = clip.crew.each(clip, begun_again, [(fitted[key][0], [better, *sources], count) for key in takers])
     return better, {**fitted, **{key: (fit, fitted[key][1]) for key, fit in zip(takers, fits, strict=True)}}
 
 
-def begun_again(clip: ClipFit, fit: Fit, sources: list[np.ndarray], count: int) -> Fit:
-    """The fit, or a better one from base parameters that others found; ``count``: how many these are."""
-    own = fit.z[count:]
-    points = [np.concatenate([z, part]) for z in sources for part in ([own, 0 * own] if len(own) else [own])]
-    points = np.array([point for point in points if not np.array_equal(point, fit.z)])
-    if not len(points):
+def begun_again(clip: ClipFit, fit: Fit, sources: list[Fit], count: int) -> Fit:
+    """The fit, or a better one from ordinary numbers that others found; ``count``: how many these are."""
+    best, least = None, NEAR * fit.cost
+    for source in sources:
+        # Near the source's path contacts may err as they may there.
+        hypothesis = dataclasses.replace(fit.hypothesis, slack=source.hypothesis.slack)
+        own = fit.z[count:]
+        points = [np.concatenate([source.z[:count], part]) for part in ([own, 0 * own] if len(own) else [own])]
+        points = np.array([point for point in points if not np.array_equal(point, fit.z)])
+        if len(points):
+            costs = clip.residuals(hypothesis, points)[1]
+            if costs.min() < least:
+                best, least = (hypothesis, points[int(np.argmin(costs))]), float(costs.min())
+    if best is None:
         return fit
-    costs = clip.residuals(fit.hypothesis, points)[1]
-    best = int(np.argmin(costs))
-    if not costs[best] < NEAR * fit.cost:
-        return fit
-    again = clip.fit(fit.hypothesis, points[best], ITERATIONS)
+    again = knocked(clip, clip.fit(*best, ITERATIONS))
     return again if again.evidence > fit.evidence else fit
 
 
@@ -68,7 +72,8 @@ def at_least_nothing(clip: ClipFit, base: Fit, fitted: Fitted) -> Fitted:
 
 def _of_nothing(clip: ClipFit, base: Fit, fit: Fit) -> Fit:
     nothing = np.zeros(len(fit.z) - len(base.z))
-    there = clip.at(fit.hypothesis, np.concatenate([base.z, nothing]))
+    hypothesis = dataclasses.replace(fit.hypothesis, slack=base.hypothesis.slack)
+    there = clip.at(hypothesis, np.concatenate([base.z, nothing]))
     return there if there.evidence > fit.evidence else fit
 
 

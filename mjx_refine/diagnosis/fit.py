@@ -15,7 +15,7 @@ from mjx_refine.diagnosis.crew import Crew
 from mjx_refine.diagnosis.fitted import Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
-from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, settled
+from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, jagged, settled
 from mjx_refine.diagnosis.pace import STEPS, Standing, descended
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.roam import GENERATIONS, ROAMED, Strategy
@@ -112,18 +112,25 @@ class ClipFit:
 
     def allow_slack(self, fit: Fit) -> int:
         """Lets contacts along a fit's path err, and masks be a little wide; returns how many impacts there are."""
-        batch = fit.hypothesis.batch(fit.z[None])
-        poses = self.poses(fit.hypothesis, fit.z[None])[0]
         self._loose, self._columns, self._slacks = None, None, Slacks()
+        self._loose, found = self._loose_along(fit) or (None, 0)
+        self.set_slackness(self.slackness)
+        return found
+
+    def slack_along(self, fit: Fit) -> Float[np.ndarray, "residuals columns"] | None:
+        """What contacts along a fit's own path may err by, as a hypothesis holds it; None where none may, or no path is."""
+        along = None if self._columns is None else self._loose_along(fit)
+        return None if along is None else along[0].columns(self.slackness, self.rigid)
+
+    def _loose_along(self, fit: Fit) -> tuple[Loose, int] | None:
+        batch, poses = fit.hypothesis.batch(fit.z[None]), self.poses(fit.hypothesis, fit.z[None])[0]
         if not np.isfinite(poses).all():
-            return 0
+            return None
         plain = self.poses(*fit.ordinary)[0] if fit.hypothesis.terms else None
         found, long = self._contacts(batch, poses, plain)
         still = self.predictor(poses[None], batch)
         kicks = self.kicks(batch, poses, still, [*found, *long], PART) if found or long else None
-        self._loose = self._loosened(batch, poses, found, still, kicks)
-        self.set_slackness(self.slackness)
-        return len(found)
+        return self._loosened(batch, poses, found, still, kicks), len(found)
 
     def _contacts(self, batch: SceneBatch, poses: np.ndarray, plain: np.ndarray | None) -> Contacts:
         return contacts(batch, poses, plain, self.simulator.fps)
@@ -185,16 +192,13 @@ class ClipFit:
         white = self.measured.split(self.residuals(fit.hypothesis, fit.z[None])[0][0])
         counts = self.counts.of(self.measured.parts)
         left = Parts(*(w * sigma / np.sqrt(c) for w, sigma, c in zip(white, self.widths, counts, strict=True)))
-        chaos, m = believed(jaggedness(told), left), self.measured
-        self.noise = Noise(
-            np.hypot(m.edge_noise, chaos.reach),
-            np.hypot(m.flow_noise, chaos.flow),
-            np.hypot(m.moment_noise, chaos.moments),
-            self.noise.background,
-        )
+        self.noise = jagged(self.measured, believed(jaggedness(told), left), self.noise.background)
 
-    def _slack(self, keep: np.ndarray | None, excused: np.ndarray | None) -> Slack | None:
-        return None if self._columns is None else self._slacks.of(self._columns, excused, keep, self.kept)
+    def _slack(self, keep: np.ndarray | None, told: Hypothesis | None) -> Slack | None:
+        if self._columns is None:
+            return None
+        own, excused = (None, None) if told is None else (told.slack, told.excused)
+        return self._slacks.of(self._columns if own is None else own, excused, keep, self.kept)
 
     @property
     def slack_columns(self) -> Float[np.ndarray, "residuals columns"]:
@@ -226,13 +230,13 @@ class ClipFit:
         distances: Parts,
         keep: Bool[np.ndarray, "frames"] | None,
         scale: float,
-        excused: np.ndarray | None = None,
+        hypothesis: Hypothesis | None = None,
     ) -> Float[np.ndarray, "batch residuals"]:
         """Robust residuals in noise widths; zero where nothing was measured, and in frames that are not kept.
 
-        ``excused``: what a hypothesis may err by beside what all may, one standard deviation a column.
+        ``hypothesis``: whose they are, and what may err under it; None: what may err in the clip.
         """
-        white, slack = self.rigid(distances, keep, scale), self._slack(keep, excused)
+        white, slack = self.rigid(distances, keep, scale), self._slack(keep, hypothesis)
         return white if slack is None else slack(white)
 
     @property
@@ -281,7 +285,7 @@ class ClipFit:
     def residuals(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE):
         """(residuals (B, R), half their sum of squares with the prior (B,))."""
         prediction = self.predictor(self.poses(hypothesis, z), hypothesis.batch(z))
-        white = self.whitened(self.distances(prediction), keep, scale, hypothesis.excused)
+        white = self.whitened(self.distances(prediction), keep, scale, hypothesis)
         cost = 0.5 * (white**2).sum(1) + 0.5 * (prior(hypothesis, z)[0] ** 2).sum(1)
         return white, np.where(prediction.bad, np.inf, cost)
 
@@ -293,7 +297,7 @@ class ClipFit:
         white = self.rigid(self.distances(prediction), keep, scale)
         change = np.where(prediction.bad[told.row, None], 0.0, white[told.row] - white[0])
         change = np.where(told.felt[:, self.measured.objects], change, 0.0)
-        slack = self._slack(keep, hypothesis.excused)
+        slack = self._slack(keep, hypothesis)
         return ((change if slack is None else slack(change)) / step[:, None]).T
 
     # --- least squares --------------------------------------------------------------------------------------------
@@ -381,9 +385,8 @@ class ClipFit:
         price_of_z, slope = prior(hypothesis, z)
         cost = data + 0.5 * float(price_of_z @ price_of_z)
         logdet = float(np.linalg.slogdet(jacobian.T @ jacobian + np.diag(slope**2))[1])
-        price = sum(np.log(t.places) for t in hypothesis.terms)
-        if hypothesis.excused is not None and (slack := self._slack(keep, hypothesis.excused)) is not None:
-            price += slack.price - self._slack(keep, None).price  # type: ignore[union-attr]
+        slack = self._slack(keep, hypothesis)
+        price = sum(np.log(t.places) for t in hypothesis.terms) + (slack.price if slack else 0.0)
         return Fit(hypothesis, z, cost, data, jacobian, base, -cost - 0.5 * logdet - price, ended)
 
     def at(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE) -> Fit:

@@ -76,7 +76,7 @@ def _outside(clip: ClipFit, fit: Fit, keep: np.ndarray) -> np.ndarray:
     again = clip.fit(fit.hypothesis, fit.z, 6, keep=keep)
     batch = again.hypothesis.batch(again.z[None])
     distances = clip.distances(clip.predictor(clip.poses(again.hypothesis, again.z[None]), batch))
-    return np.where(keep, 0.0, _by_frame(clip, clip.whitened(distances, None, 20.0, again.hypothesis.excused)[0]))
+    return np.where(keep, 0.0, _by_frame(clip, clip.whitened(distances, None, 20.0, again.hypothesis)[0]))
 
 
 def _by_frame(clip: ClipFit, white: np.ndarray) -> np.ndarray:

@@ -77,10 +77,13 @@ class Hypothesis:
     Attributes:
       space: the base model's parameters.
       terms: the effects at work.
+      slack: what contacts along a path of this hypothesis may err by, one standard deviation a column [noise widths]; None:
+        what the clip's may.
     """
 
     space: Space
     terms: tuple[Term, ...] = ()
+    slack: Float[np.ndarray, "residuals columns"] | None = None
 
     @property
     def dimension(self) -> int:

@@ -30,7 +30,8 @@ MOVED = 1e-4
 
 
 def knocked(clip: ClipFit, fit: Fit, rival: float = np.inf) -> Fit:
-    """The fit once its impacts with unseen things may err; the same where it has none, or costs far more than ``rival``."""
+    """The fit once contacts along its own path, and its impacts with unseen things, may err; the same where that explains
+    less, or where it costs far more than ``rival``."""
     for _ in range(ROUNDS):
         if fit.cost > HOPE * rival + FAR_BEHIND:
             break
@@ -38,9 +39,10 @@ def knocked(clip: ClipFit, fit: Fit, rival: float = np.inf) -> Fit:
             dataclasses.replace(t, excused=excuses(clip, fit, k)) if t.kind.strikes else t
             for k, t in enumerate(fit.hypothesis.terms)
         )
-        if all(t.excused is None for t in terms):
+        own = dataclasses.replace(fit.hypothesis, terms=terms, slack=clip.slack_along(fit))
+        if own.slack is None and own.excused is None:
             break
-        trial = clip.fit(dataclasses.replace(fit.hypothesis, terms=terms), fit.z, ITERATIONS, rival=rival)
+        trial = clip.fit(own, fit.z, ITERATIONS, rival=rival)
         gain = trial.evidence - fit.evidence
         fit = trial if gain > 0 else fit
         if gain < LITTLE:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
@@ -39,4 +41,8 @@ def begun(clip: ClipFit, here: Fit, lead: Lead, scale: float) -> tuple[Hypothesi
     one = lead.term(clip.frames)
     hypothesis = here.hypothesis.added(one)
     z = beginning(clip, hypothesis, here, lead, lead.z(one))
-    return hypothesis, clip.fit(hypothesis, z, FIRST, scale=scale).z if scale > SCALE else z
+    if scale <= SCALE:
+        return hypothesis, z
+    fit = clip.fit(hypothesis, z, FIRST, scale=scale)
+    # Far from where it began, contacts are others.
+    return dataclasses.replace(hypothesis, slack=clip.slack_along(fit)), fit.z

@@ -61,6 +61,16 @@ class Counts:
         )
 
 
+def jagged(measured: Measured, chaos: Parts, background: float) -> Noise:
+    """The measurement's noise and what a rollout jumps by, together."""
+    return Noise(
+        np.hypot(measured.edge_noise, chaos.reach),
+        np.hypot(measured.flow_noise, chaos.flow),
+        np.hypot(measured.moment_noise, chaos.moments),
+        background,
+    )
+
+
 def everywhere(measured: Measured, frames: int) -> Noise:
     """The same noise in every frame."""
     return Noise(

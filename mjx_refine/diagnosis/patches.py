@@ -9,6 +9,7 @@ import numpy as np
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.screen import term_of
 from mjx_refine.effects.friction_patch import FrictionPatch
 from mjx_refine.effects.kind import FitView
@@ -55,4 +56,5 @@ def _crossings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis,
 
 
 def _fitted(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray, iterations: int) -> Fit:
-    return clip.fit(hypothesis, z, iterations)
+    fit = clip.fit(hypothesis, z, iterations)
+    return knocked(clip, fit) if iterations > LOOK else fit

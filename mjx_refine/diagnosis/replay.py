@@ -72,4 +72,4 @@ def _fixed(t: Term, values: np.ndarray) -> Term:
 def _held(fit: Fit) -> Hypothesis:
     """The fit's hypothesis with its effects held at their values."""
     terms = tuple(_fixed(t, fit.hypothesis.values(fit.z[None], k)[0]) for k, t in enumerate(fit.hypothesis.terms))
-    return dataclasses.replace(fit.hypothesis, terms=terms)
+    return dataclasses.replace(fit.hypothesis, terms=terms, slack=None)

@@ -155,7 +155,7 @@ class Screen:
         else:
             poses = np.repeat(self.poses, len(z), 0)
         prediction = self.clip.predictor(poses, batch)
-        white = self.clip.whitened(self.clip.distances(prediction), None, self.scale, self.fit.hypothesis.excused)
+        white = self.clip.whitened(self.clip.distances(prediction), None, self.scale, self.fit.hypothesis)
         return np.where(prediction.bad[:, None], 1e3, white)
 
     def _lead(self, kind: EffectKind, target: int, start: Start, white: np.ndarray) -> Lead:

@@ -13,7 +13,7 @@ from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_
 from mjx_refine.diagnosis.exchange import Fitted, Key, alone, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
-from mjx_refine.diagnosis.leads import FORGIVING, begun, chosen_of
+from mjx_refine.diagnosis.leads import FIRST, FORGIVING, begun, chosen_of
 from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.pairs import Told, pairs_of
 from mjx_refine.diagnosis.patches import patches_from_pushes
@@ -97,7 +97,7 @@ def compare(
     clip.settle_noise(base)
     clip.allow_chaos(base, seed)
     impacts = clip.allow_slack(base)
-    base = clip.fit(base.hypothesis, base.z, 10)
+    base = _of_own_contacts(clip, clip.fit(base.hypothesis, base.z, 10))
     names = [name for name in catalogue() if name not in without]
     base, singles = _singles(clip, base, names, scene, observation, masks_of, seed, told)
     if (thin := thinness(singles)) > THIN and clip.leave_out(_may_be_cut(clip, observation, masks_of, thin)):
@@ -117,6 +117,7 @@ def _singles(
     walled: list[Fit] = []
     tried: Fit | None = None
     zero = clip.at(base.hypothesis, np.zeros(base.hypothesis.dimension), scale=FORGIVING)
+    zero = clip.at(dataclasses.replace(zero.hypothesis, slack=clip.slack_along(zero)), zero.z, scale=FORGIVING)
     for again in range(2):
         told("looking ahead")
         view = view_of(clip, base, observation, masks_of)
@@ -136,8 +137,9 @@ def _singles(
         # What an effect's fit found for the base parameters may serve the base model as well.
         if best is tried or not fitted:
             break
-        tried, other = best, clip.fit(base.hypothesis, best.z[: base.hypothesis.dimension], 8)
-        if other.cost > base.cost - 1.0:
+        ground = dataclasses.replace(base.hypothesis, slack=best.hypothesis.slack)
+        tried, other = best, knocked(clip, clip.fit(ground, best.z[: base.hypothesis.dimension], 8))
+        if other.evidence < base.evidence + 1.0:
             break
         base = other
     _from_the_best(clip, base, fitted, names, observation, masks_of, told, scene)
@@ -162,7 +164,7 @@ def _from_the_best(
         return
     told("looking ahead from the best effect's numbers")
     z = fitted[best][0].z[: base.hypothesis.dimension]
-    ground = clip.at(base.hypothesis, z, scale=FORGIVING)
+    ground = clip.at(dataclasses.replace(base.hypothesis, slack=fitted[best][0].hypothesis.slack), z, scale=FORGIVING)
     leads = Screen(clip, ground, view_of(clip, ground, observation, masks_of), FORGIVING).leads(names)
     leads = [lead for lead in leads if (lead.name, lead.target) != best]
     rows = [(ground, lead, FORGIVING) for lead in chosen_of(leads, FROM_BEST, 1)]
@@ -191,7 +193,19 @@ def _keep(fitted: Fitted, key: Key, fit: Fit, promise: float) -> None:
 
 
 def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
-    return clip.roam(clip.fit(fit.hypothesis, fit.z, 8), seed, ROAMED_AGAIN)
+    return knocked(clip, clip.roam(clip.fit(fit.hypothesis, fit.z, 8), seed, ROAMED_AGAIN))
+
+
+def _of_own_contacts(clip: ClipFit, base: Fit) -> Fit:
+    """The base model's fit with what may err along its own path; or, where that explains more, from the given scene.
+
+    What two engines' contacts differ by bends the ordinary numbers where contacts may not err; about a path near the given
+    scene's they may, and nothing has bent.
+    """
+    begun = clip.fit(base.hypothesis, np.zeros(len(base.z)), FIRST, scale=FORGIVING)
+    ground = dataclasses.replace(base.hypothesis, slack=clip.slack_along(begun))
+    fits = clip.crew.each(clip, knocked, [(base,), (clip.fit(ground, begun.z, 10),)])
+    return max(fits, key=lambda fit: fit.evidence)
 
 
 def _keep_leads(clip: ClipFit, base: Fit, fitted: Fitted, rows: list[Row], told: Told, scene: Scene) -> None:
@@ -257,7 +271,7 @@ def _again(
     for _ in range(SETTLINGS):
         taken = clip.measured.moment_noise
         clip.settle_noise(best, order=1)
-        best = clip.at(best.hypothesis, best.z)
+        best = _along_its_own(clip, best)
         if np.all(clip.measured.moment_noise > SETTLED * taken):
             break
     clip.allow_chaos(best, seed)
@@ -287,8 +301,13 @@ def _may_be_cut(clip: ClipFit, observation: Observation, masks_of: tuple[int, ..
     return measure(observation, columns, BESIDE + math.ceil(2 * thin))
 
 
+def _along_its_own(clip: ClipFit, fit: Fit) -> Fit:
+    """The fit as it stands once what contacts may err by is told in the noise widths of now."""
+    return clip.at(dataclasses.replace(fit.hypothesis, slack=clip.slack_along(fit)), fit.z)
+
+
 def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:
-    # What an impact may err by is told in noise widths, which are others now.
+    fit = _along_its_own(clip, fit)
     return knocked(clip, clip.fit(fit.hypothesis, fit.z, iterations))
 
 

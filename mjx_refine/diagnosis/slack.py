@@ -107,10 +107,12 @@ class Slacks:
     """What was made of a clip's columns, by frames that are kept and by what a hypothesis adds.
 
     Attributes:
-      made: by keys; with the columns that were added, so that no other array comes to have their address.
+      made: by keys; with the columns that these are of, so that no other array comes to have their address.
     """
 
-    made: dict[tuple[bytes, int], tuple[Slack, np.ndarray | None]] = dataclasses.field(default_factory=dict)
+    made: dict[tuple[bytes, int, int], tuple[Slack, np.ndarray, np.ndarray | None]] = dataclasses.field(
+        default_factory=dict
+    )
 
     def of(
         self,
@@ -119,13 +121,13 @@ class Slacks:
         keep: np.ndarray | None,
         kept: Callable[[np.ndarray], np.ndarray],
     ) -> Slack:
-        """From the clip's columns and a hypothesis' own, where ``keep`` (None: everywhere) says by ``kept``."""
-        key = (b"" if keep is None else keep.tobytes(), id(added))
+        """From the columns of contacts and what a hypothesis adds, where ``keep`` (None: everywhere) says by ``kept``."""
+        key = (b"" if keep is None else keep.tobytes(), id(columns), id(added))
         if key not in self.made:
             if len(self.made) >= REMEMBERED:
                 self.made.pop(next(iter(self.made)))
             both = columns if added is None else np.concatenate([columns, added], 1)
-            self.made[key] = (slack_of(both if keep is None else both * kept(keep)[:, None]), added)
+            self.made[key] = (slack_of(both if keep is None else both * kept(keep)[:, None]), columns, added)
         return self.made[key][0]
 
 

@@ -122,6 +122,7 @@ def _tokens(part: object) -> Iterable[bytes]:
         yield np.ascontiguousarray(part).tobytes()
     elif isinstance(part, Hypothesis):
         yield repr(part.space).encode()
+        yield from _tokens(part.slack)
         for t in part.terms:
             yield from _tokens((t.name, t.target, t.centre, t.width, t.low, t.high, t.free, t.places, t.excused))
     elif isinstance(told := getattr(part, "parts", None), tuple):

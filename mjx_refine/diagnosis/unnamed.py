@@ -6,13 +6,13 @@ may change as it likes explains more than that push, by more than its numbers co
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-
-import numpy as np
 
 from mjx_refine.diagnosis.candidates import Compared, Freed
 from mjx_refine.diagnosis.exchange import NEAR, SOURCES, begun_again
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
+from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import FORGIVING, begun
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.effects.free_force import FreeForce
@@ -37,11 +37,11 @@ def freely_forced(
     base = compared.base
     looks = [(base, seen, SCALE)]
     if best is not base:
-        bare = clip.at(base.hypothesis, best.z[: base.hypothesis.dimension], scale=FORGIVING)
+        ground = dataclasses.replace(base.hypothesis, slack=best.hypothesis.slack)
+        bare = clip.at(ground, best.z[: base.hypothesis.dimension], scale=FORGIVING)
         looks.append((bare, shown(bare), FORGIVING))
     leads = clip.crew.each(clip, _best_lead, looks)
-    count = base.hypothesis.dimension
-    others = [base.z, *(one.fit.z[:count] for one in (*compared.candidates[:SOURCES], *compared.pairs[:1]))]
+    others = [base, *(one.fit for one in (*compared.candidates[:SOURCES], *compared.pairs[:1]))]
     rows = [(here, lead, scale, best.cost, others) for (here, _, scale), lead in zip(looks, leads, strict=True)]
     fits = clip.crew.each(clip, _fitted, rows)
     fit = max(fits, key=lambda one: one.evidence)
@@ -56,7 +56,7 @@ def _best_lead(clip: ClipFit, here: Fit, view: FitView, scale: float) -> Lead:
     return max(leads, key=lambda lead: lead.gain)
 
 
-def _fitted(clip: ClipFit, here: Fit, lead: Lead, scale: float, rival: float, others: list[np.ndarray]) -> Fit:
+def _fitted(clip: ClipFit, here: Fit, lead: Lead, scale: float, rival: float, others: list[Fit]) -> Fit:
     hypothesis, z = begun(clip, here, lead, scale)
-    fit = clip.fit(hypothesis, z, ITERATIONS, rival=rival)
+    fit = knocked(clip, clip.fit(hypothesis, z, ITERATIONS, rival=rival), rival)
     return begun_again(clip, fit, others, here.hypothesis.dimension) if fit.cost < NEAR * rival else fit

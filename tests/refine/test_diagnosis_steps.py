@@ -173,6 +173,9 @@ class _Bowl:
     """Stands in for a hypothesis of a bowl around ``bottom``."""
 
     bottom: tuple[float, ...]
+    terms: tuple = ()
+    slack: None = None
+    excused: None = None
 
     @property
     def dimension(self) -> int:
@@ -187,6 +190,9 @@ class _Stuck:
 
     def residuals(self, hypothesis, points):
         return None, ((points - np.array(hypothesis.bottom)) ** 2).sum(1) + 1.0
+
+    def slack_along(self, fit):
+        return None
 
     def fit(self, hypothesis, z, iterations):
         cost = float(self.residuals(hypothesis, z[None])[1][0])

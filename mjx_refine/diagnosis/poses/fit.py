@@ -219,7 +219,7 @@ class PosesFit(ClipFit):
         step = np.where(z + size > high, -size, size)
         points = np.concatenate([z[None], np.clip(z + np.diag(step), low, high)])
         prediction = self.predictor(self.poses(hypothesis, points), hypothesis.batch(points))
-        white = self.whitened(self.distances(prediction), keep, scale, hypothesis.excused)
+        white = self.whitened(self.distances(prediction), keep, scale, hypothesis)
         return (np.where(prediction.bad[1:, None], 0.0, white[1:] - white[0]) / step[:, None]).T
 
     def distances(self, prediction: Prediction) -> Parts:

@@ -61,7 +61,7 @@ def _outside(clip: PosesFit, fit: Fit, keep: np.ndarray) -> tuple[np.ndarray, Er
     """Mean square residual of every sample [noise widths squared], and errors of the held-out ones."""
     again = clip.fit(fit.hypothesis, fit.z, 6, keep=keep)
     position, rotation = errors_of(clip, again)
-    energy = _by_sample(clip, clip.whitened(_distances(clip, again), None, 20.0, again.hypothesis.excused)[0])
+    energy = _by_sample(clip, clip.whitened(_distances(clip, again), None, 20.0, again.hypothesis)[0])
     return energy, Errors(_root(position[~keep]), _root(rotation[~keep]))
 
 
