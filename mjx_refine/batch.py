@@ -9,6 +9,10 @@ from jaxtyping import Float
 
 from mjx_refine.scene import Body, Camera, Scene, Shape
 
+GRIP = 30.0
+"""Of every scene's contacts [1/s] (minus the second number of ``solreffriction``): softer makes friction syrup, harder makes
+sliding bodies hop."""
+
 
 @dataclasses.dataclass(frozen=True)
 class BatchEffect:
@@ -36,6 +40,7 @@ class SceneBatch:
       friction: (sliding [1], rolling [m]).
       damping: contact damping, <= 0 [1/s].
       stiffness: > 0 [1/s^2].
+      grip: damping of friction, > 0 [1/s]: how soon a contact takes slip away where its friction is enough.
       position: centres at the first frame, world frame [m].
       quaternion: unit, w x y z, body to world.
       linear_velocity: world frame [m/s].
@@ -53,6 +58,7 @@ class SceneBatch:
     friction: Float[np.ndarray, "batch objects 2"]
     damping: Float[np.ndarray, "batch objects"]
     stiffness: Float[np.ndarray, "batch objects"]
+    grip: Float[np.ndarray, "batch objects"]
     position: Float[np.ndarray, "batch objects 3"]
     quaternion: Float[np.ndarray, "batch objects 4"]
     linear_velocity: Float[np.ndarray, "batch objects 3"]
@@ -126,6 +132,7 @@ def batch_from_scenes(scenes: list[Scene]) -> SceneBatch:
         friction=rows(lambda b: b.friction),
         damping=rows(lambda b: b.damping),
         stiffness=rows(lambda b: b.stiffness),
+        grip=rows(lambda b: GRIP),
         position=rows(lambda b: b.position),
         quaternion=rows(lambda b: b.orientation),
         linear_velocity=rows(lambda b: b.linear_velocity),

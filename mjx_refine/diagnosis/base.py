@@ -6,9 +6,10 @@ import dataclasses
 import math
 
 import numpy as np
+from jaxtyping import Bool
 
 from mjx_refine import rotations
-from mjx_refine.batch import batch_from_scenes
+from mjx_refine.batch import GRIP, batch_from_scenes
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.store import remembered
@@ -18,7 +19,7 @@ from mjx_refine.search.features import flow_points, outlines
 from mjx_refine.search.landing import LeastSquares
 from mjx_refine.search.schedule import stages
 from mjx_refine.space import Space
-from mjx_refine.space.layout import lowest_extent
+from mjx_refine.space.layout import logarithmic, lowest_extent
 from mjx_refine.view.tiles import foreground
 
 RESTING = ("clearance", "tilt")
@@ -26,6 +27,12 @@ RESTING = ("clearance", "tilt")
 TRUST = 0.2
 """Width of the prior around the given scene, in errors of a language model: the scene is thought to be refined. Its tails
 are heavy (``Hypothesis.tails``), so that a rough scene may move."""
+
+GRIP_WIDTH, SOFTEST, FIRMEST = 0.7, 8.0, 300.0
+"""Width of the prior of a contact's grip, in natural logarithms, and its bounds [1/s]."""
+
+NOTABLE = 2.0
+"""Factor to a scene file's grip from which a note says so."""
 
 GOOD = 2.5
 """Mean square residual below which no further start is tried."""
@@ -56,6 +63,42 @@ def base_space(scene: Scene) -> Space:
     return dataclasses.replace(
         space, parameters=tuple(dataclasses.replace(p, width=TRUST * p.width) for p in space.parameters)
     )
+
+
+def with_grips(space: Space) -> Space:
+    """The space, and how soon each object's contacts take slip away, which a scene file does not tell.
+
+    A scene file's contacts take 1/30 s, longer than an impact lasts: what strikes the floor obliquely gets less spin than from a
+    rigid contact, and a fit bends velocities, sizes and gravity to make up for it.
+    """
+    grips = [
+        logarithmic(f"{body.name}.grip", "1/s", "grip", (i, 0), GRIP, GRIP_WIDTH, SOFTEST, FIRMEST)
+        for i, body in enumerate(space.scene.objects)
+    ]
+    return dataclasses.replace(space, parameters=(*space.parameters, *grips))
+
+
+def without_grips(space: Space) -> tuple[Space, Bool[np.ndarray, "dimension"]]:
+    """The space with contacts as every scene file has them, and which coordinates stay."""
+    held = np.array([p.field == "grip" for p in space.parameters], bool)
+    return (space.freeze(held, space.start, "a scene file does not tell it") if held.any() else space), ~held
+
+
+def grip_notes(fit: Fit) -> list[str]:
+    """Sentences about contacts that take slip away much sooner or later than a scene file's do."""
+    space = fit.hypothesis.space
+    told = []
+    for k, p in enumerate(space.parameters):
+        if p.field == "grip":
+            unit = np.clip(space.start[k] + fit.z[k] * space.sigma[k], 0.0, 1.0)
+            value, name = float(p.from_unit(unit)), p.name.removesuffix(".grip")
+            if not 1 / NOTABLE < value / GRIP < NOTABLE:
+                how = "sooner" if value > GRIP else "later"
+                told.append(
+                    f"Contacts of {name} take slip away {how} than a scene file's do ({value:.0f} 1/s for {GRIP:.0f}): in the "
+                    f"replayed scene oblique impacts change spin {'less' if value > GRIP else 'more'} than in the clip."
+                )
+    return told
 
 
 def _lies_flat(scene: Scene, i: int, body: Body) -> bool:
@@ -96,9 +139,8 @@ def fit_base(clip: ClipFit, space: Space, observation: Observation, masks_of: tu
     columns = tuple(seen.ids.index(i) if i in seen.ids else -1 for i in masks_of)
     flow = flow_points(masks, observation.flow, seen.ids)
     fits: list[Fit] = [clip.fit(hypothesis, np.zeros(space.dimension), 10)]
-    wide = dataclasses.replace(
-        space, parameters=tuple(dataclasses.replace(p, width=p.width / TRUST) for p in space.parameters)
-    )
+    rough = [p if p.field == "grip" else dataclasses.replace(p, width=p.width / TRUST) for p in space.parameters]
+    wide = dataclasses.replace(space, parameters=tuple(rough))
     for hops in (0, 2):
         landing = LeastSquares(wide, clip.rollout, seen, columns, observation.size, flow)
         point = landing.run(space.start, stages(observation.length), hops).point

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from mjx_refine.children import cores
 from mjx_refine.compile_cache import enable_cache
+from mjx_refine.diagnosis.base import grip_notes
 from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared
 from mjx_refine.diagnosis.crew import Crew, crew_of
 from mjx_refine.diagnosis.fit import ClipFit, Fit
@@ -393,4 +394,4 @@ def _notes(clip: ClipFit, compared: Compared, said: Answer, matching, names, bes
         notes.append(
             f"{compared.impacts} impacts may each err by 8 % of their change of velocity before anything else is blamed."
         )
-    return tuple(notes)
+    return (*notes, *grip_notes(best.fit if best is not None else compared.base))

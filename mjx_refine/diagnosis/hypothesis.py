@@ -18,7 +18,7 @@ TAIL = 6.0
 """Prior widths beyond which moving a base parameter costs ever less: half its price is TAIL^2 log(1 + (z / TAIL)^2). Nearer
 tails let size, camera and velocity bend until they imitate an effect."""
 
-CONTACTS, CONTACT_TAIL = ("friction", "resistance"), 2.0
+CONTACTS, CONTACT_TAIL = ("friction", "resistance", "grip"), 2.0
 """Fields that mean something else in every engine, and on every real floor, and their tail."""
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Float
 
+from mjx_refine.diagnosis.base import without_grips
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis, Term
 from mjx_refine.diagnosis.noise import everywhere
@@ -48,13 +50,13 @@ def replays(clip: ClipFit, fits: list[Fit], problem: Problem, matching: tuple[in
 
 
 def _rigid(clip: ClipFit, fit: Fit) -> np.ndarray:
-    held = _held(fit)
-    return clip.fit(held, fit.z[: held.dimension], ITERATIONS).z
+    held, z = _held(fit)
+    return clip.fit(held, z, ITERATIONS).z
 
 
 def _replay(clip: ClipFit, fit: Fit, rigid: np.ndarray, problem: Problem, matching: tuple[int, ...]) -> Replay:
-    held = _held(fit)
-    here, given = fit.z[: held.dimension], np.zeros(held.dimension)
+    held, here = _held(fit)
+    given = np.zeros(held.dimension)
     scenes = [held.scene(z, clip.frames) for z in (rigid, here, given)]
     # To draw every picture takes seconds a scene: which is best is seen in small ones.
     drawn = needs_pictures(held.batch(rigid[None]))
@@ -69,7 +71,8 @@ def _fixed(t: Term, values: np.ndarray) -> Term:
     return dataclasses.replace(t, centre=values, free=np.zeros(len(values), bool), excused=None)
 
 
-def _held(fit: Fit) -> Hypothesis:
-    """The fit's hypothesis with its effects held at their values."""
+def _held(fit: Fit) -> tuple[Hypothesis, Float[np.ndarray, "dimension"]]:
+    """The fit's hypothesis with its effects held at their values and contacts as a scene file has them, and its point."""
     terms = tuple(_fixed(t, fit.hypothesis.values(fit.z[None], k)[0]) for k, t in enumerate(fit.hypothesis.terms))
-    return dataclasses.replace(fit.hypothesis, terms=terms, slack=None)
+    space, stay = without_grips(fit.hypothesis.space)
+    return dataclasses.replace(fit.hypothesis, space=space, terms=terms, slack=None), fit.z[: len(stay)][stay]

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mjx_refine.diagnosis.base import base_space, stored_base
+from mjx_refine.diagnosis.base import base_space, stored_base, with_grips
 from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_of
 from mjx_refine.diagnosis.exchange import Fitted, Key, alone, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
@@ -87,7 +87,7 @@ def compare(
       begin: makes the base model's first fit, where not pictures but poses were measured.
     """
     told("base model")
-    base = begin() if begin is not None else stored_base(clip, base_space(scene), observation, masks_of)
+    base = begin() if begin is not None else stored_base(clip, with_grips(base_space(scene)), observation, masks_of)
     clip.settle_noise(base)
     clip.allow_chaos(base, seed)
     impacts = clip.allow_slack(base)

@@ -34,6 +34,7 @@ class Signs:
       unmistakable: 1 where the best single effect is one that nothing else looks like, and leads every other by far.
       unnamed: gain in evidence of a force of any course over the best hypothesis; 0 where that was not asked.
       aloft: 1 where that force's object is in the air for most of the time.
+      background: mean square residual of the background's flow that the best hypothesis leaves, noise widths squared.
     """
 
     lead: float
@@ -52,6 +53,7 @@ class Signs:
     unmistakable: float = 0.0
     unnamed: float = 0.0
     aloft: float = 0.0
+    background: float = 0.0
 
 
 def signs(clip: ClipFit, compared: Compared, held_out: float, closed: float = 1.0) -> Signs:
@@ -80,6 +82,7 @@ def signs(clip: ClipFit, compared: Compared, held_out: float, closed: float = 1.
         unmistakable=float(first is not None and first.names[0] in UNMISTAKABLE and margin > BY_FAR),
         unnamed=(freed.fit.evidence - after.evidence) / unit if freed else 0.0,
         aloft=float(freed is not None and freed.on_floor < MOSTLY),
+        background=unsteadiness(clip, after),
         beside=float(bool(pairs) and _beside([t.name for t in pairs[0].fit.hypothesis.terms])),
     )
 
@@ -93,6 +96,11 @@ def best_candidate(compared: Compared) -> Candidate | None:
     """The best of singles and pairs, or None where nothing leads the base model."""
     found = [c for c in (*compared.candidates[:1], *compared.pairs[:1]) if c.lead > 0]
     return max(found, key=lambda c: c.lead) if found else None
+
+
+def unsteadiness(clip: ClipFit, fit) -> float:
+    """Mean square residual of the background's flow [noise widths squared]."""
+    return float(misfit_map(clip, fit)[2].mean())
 
 
 def structure(clip: ClipFit, fit) -> float:
@@ -140,6 +148,9 @@ without effect of seeds 10 to 12 they led by 30 at most."""
 ODD, RESTLESS = 3.0, 2.5
 """Structure of the residuals, and their mean square, from which something is missing though no effect leads enough to be
 named: on eight clips without effect of the withheld exams that mean square was 0.4 to 1."""
+
+STILL = 0.5
+"""Mean square residual of the background's flow above which the camera does something that has not been named."""
 
 CLOSES = 0.1
 """Part of the gap on frames that no fit has seen which what is named must close: else it merely bends with the frames seen, and
@@ -265,6 +276,8 @@ def _forced(told: Signs) -> bool:
 
 
 def _answered(told: Signs, shares: tuple[float, ...], video: bool) -> Answer:
+    if video and told.background > STILL:
+        return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
     if _slight(told, video):
         if told.structure_after > ODD or told.whole > RESTLESS or (video and told.after > FAR_OFF):
             return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])

@@ -15,9 +15,6 @@ from mjx_refine.scene import Shape
 SUBSTEPS = 8
 """Physics steps a frame, at every frame rate."""
 
-FRICTION_DAMPING = -30.0
-"""Second number of ``solreffriction`` [1/s]: softer makes friction syrup, harder makes sliding bodies hop."""
-
 TORSION = 0.005
 """Torsional friction of every contact [m]."""
 
@@ -111,6 +108,7 @@ def model_fields(batch: SceneBatch) -> ModelFields:
     sliding, rolling = np.moveaxis(np.maximum(batch.friction[:, first], batch.friction[:, second]), -1, 0)
     stiffness = np.maximum(batch.stiffness[:, first], batch.stiffness[:, second])
     damping = np.minimum(batch.damping[:, first], batch.damping[:, second])
+    grip = np.maximum(batch.grip[:, first], batch.grip[:, second])
     torsion = np.full_like(sliding, TORSION)
     return ModelFields(
         geom_size=batch.size,
@@ -120,7 +118,7 @@ def model_fields(batch: SceneBatch) -> ModelFields:
         body_invweight0=np.stack([1 / batch.mass, (1 / inertia).mean(-1)], -1),
         pair_friction=np.stack([sliding, sliding, torsion, rolling, rolling], -1),
         pair_solref=np.stack([-stiffness, damping], -1),
-        pair_solreffriction=np.stack([-stiffness, np.full_like(stiffness, FRICTION_DAMPING)], -1),
+        pair_solreffriction=np.stack([-stiffness, -grip], -1),
         gravity=batch.gravity,
     )
 

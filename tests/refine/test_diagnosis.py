@@ -94,6 +94,7 @@ def test_closed_is_what_is_left_of_the_gap():
 
 def test_what_the_background_shows_counts_whatever_effect_leads_a_little(monkeypatch):
     monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
+    monkeypatch.setattr(verdict, "unsteadiness", lambda clip, fit: 0.0)
     clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0)
     base = SimpleNamespace(data=400.0)
     one = SimpleNamespace(fit=base, lead=22.0, names=("slope",))
@@ -104,6 +105,7 @@ def test_what_the_background_shows_counts_whatever_effect_leads_a_little(monkeyp
 
 def test_two_effects_are_beside_each_other_where_one_of_them_moves_the_camera(monkeypatch):
     monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
+    monkeypatch.setattr(verdict, "unsteadiness", lambda clip, fit: 0.0)
     clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0)
 
     def fitted(*names):
@@ -128,6 +130,7 @@ def test_two_effects_are_beside_each_other_where_one_of_them_moves_the_camera(mo
 )
 def test_what_nothing_else_looks_like_is_unmistakable_where_it_leads_by_far(monkeypatch, name, behind, sure):
     monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
+    monkeypatch.setattr(verdict, "unsteadiness", lambda clip, fit: 0.0)
     clip = SimpleNamespace(misfit=lambda fit: 2.0, expected=lambda: 100.0)
     base = SimpleNamespace(data=400.0)
     one, other = (SimpleNamespace(fit=base, lead=lead, names=(n,)) for lead, n in ((400.0, name), (behind, "shape")))
