@@ -150,8 +150,8 @@ ODD, RESTLESS = 3.0, 2.5
 named: on eight clips without effect of the withheld exams that mean square was 0.4 to 1."""
 
 STILL = 1.2
-"""Mean square residual of the background's flow above which the camera does something that has not been named: 14 clips without effect
-of seed 16 of the withheld exams left up to 0.66 (measured flow), a camera that moves by 5 px left 1.4."""
+"""Mean square residual of the background's flow above which the camera does something that has not been named: 14 clips
+without effect of seed 16 of the withheld exams left up to 0.66 (measured flow), a camera that moves by 5 px left 1.4."""
 
 CLOSES = 0.1
 """Part of the gap on frames that no fit has seen which what is named must close: else it merely bends with the frames seen, and
