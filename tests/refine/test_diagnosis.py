@@ -40,6 +40,12 @@ def clip_of(scene: Scene, frames: int = 20, seed: int = 0) -> Observation:
     return Observation((flow + noise).astype(np.float32), masks, 30.0, flow_sigma=0.1, source="clip.npz")
 
 
+def without_residuals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Signs that are read off residuals are as noise has them."""
+    monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
+    monkeypatch.setattr(verdict, "unsteadiness", lambda clip, fit: 0.0)
+
+
 def test_slack_whitens_the_covariance_of_its_columns():
     columns = np.random.default_rng(0).normal(size=(12, 3)) * [3.0, 1.0, 0.5]
     whitened = slack_of(columns)(np.eye(12))
@@ -93,8 +99,7 @@ def test_closed_is_what_is_left_of_the_gap():
 
 
 def test_what_the_background_shows_counts_whatever_effect_leads_a_little(monkeypatch):
-    monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
-    monkeypatch.setattr(verdict, "unsteadiness", lambda clip, fit: 0.0)
+    without_residuals(monkeypatch)
     clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0)
     base = SimpleNamespace(data=400.0)
     one = SimpleNamespace(fit=base, lead=22.0, names=("slope",))
@@ -104,8 +109,7 @@ def test_what_the_background_shows_counts_whatever_effect_leads_a_little(monkeyp
 
 
 def test_two_effects_are_beside_each_other_where_one_of_them_moves_the_camera(monkeypatch):
-    monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
-    monkeypatch.setattr(verdict, "unsteadiness", lambda clip, fit: 0.0)
+    without_residuals(monkeypatch)
     clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0)
 
     def fitted(*names):
@@ -129,8 +133,7 @@ def test_two_effects_are_beside_each_other_where_one_of_them_moves_the_camera(mo
     [("mask_bias", 150.0, 1.0), ("mask_bias", 350.0, 0.0), ("dropped_frames", 150.0, 1.0), ("push", 150.0, 0.0)],
 )
 def test_what_nothing_else_looks_like_is_unmistakable_where_it_leads_by_far(monkeypatch, name, behind, sure):
-    monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
-    monkeypatch.setattr(verdict, "unsteadiness", lambda clip, fit: 0.0)
+    without_residuals(monkeypatch)
     clip = SimpleNamespace(misfit=lambda fit: 2.0, expected=lambda: 100.0)
     base = SimpleNamespace(data=400.0)
     one, other = (SimpleNamespace(fit=base, lead=lead, names=(n,)) for lead, n in ((400.0, name), (behind, "shape")))

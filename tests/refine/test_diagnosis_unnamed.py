@@ -10,10 +10,10 @@ import pytest
 from effect_scenes import BALL, CAMERA, FPS
 from own_clip import SIZE
 from test_diagnosis import BALL as THROWN
-from test_diagnosis import FLIGHT, SIGNS
+from test_diagnosis import FLIGHT, SIGNS, without_residuals
 
 from mjx_refine.batch import BatchEffect, batch_from_scenes
-from mjx_refine.diagnosis import diagnose, verdict
+from mjx_refine.diagnosis import diagnose
 from mjx_refine.diagnosis.candidates import Freed
 from mjx_refine.diagnosis.diagnose import TO_THE_NOISE, verdict_of
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
@@ -87,8 +87,7 @@ def test_what_explains_more_without_a_name_is_unknown(changes, kind, forced):
 
 @pytest.mark.parametrize("on_floor", [MOSTLY - 0.1, MOSTLY + 0.1])
 def test_its_gain_is_over_the_best_hypothesis(monkeypatch, on_floor):
-    monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
-    monkeypatch.setattr(verdict, "unsteadiness", lambda clip, fit: 0.0)
+    without_residuals(monkeypatch)
     clip = SimpleNamespace(misfit=lambda fit: 2.0, expected=lambda: 100.0)
     base = SimpleNamespace(data=400.0, evidence=-500.0)
     one = SimpleNamespace(fit=SimpleNamespace(evidence=-300.0, data=200.0), lead=200.0, names=("push",))
