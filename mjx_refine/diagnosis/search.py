@@ -30,7 +30,7 @@ from mjx_refine.view.moments import BESIDE
 FAMILIES = 7
 """Families (effect and target) that are fitted in full, the most promising first."""
 
-FROM_BEST = 5
+FROM_BEST = 7
 """Ditto from where the best of them found the ordinary numbers."""
 
 FRESH = 6
