@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -86,8 +88,16 @@ def places_of(
                 found.append(Place(name, (first, last), phase_of(view, n, first, last), kind, part))
     if extra.sum() > 0.05 * total and total > 0 and best is None:
         found.append(Place(None, (0, view.frames - 1), "whole", "camera", float(extra.sum()) / total * (1 - used)))
-    found.sort(key=lambda p: -p.share)
-    return tuple(found[:8])
+    return tuple(sorted(_merged(found), key=lambda p: -p.share)[:8])
+
+
+def _merged(found: list[Place]) -> list[Place]:
+    """The places, each once: where what acts and what is loud are the same, their shares together."""
+    shares: dict[Place, float] = {}
+    for place in found:
+        alike = dataclasses.replace(place, share=0.0)
+        shares[alike] = shares.get(alike, 0.0) + place.share
+    return [dataclasses.replace(place, share=share) for place, share in shares.items()]
 
 
 def _acting(best: Fit, view: FitView, names, channel, excess, share: float) -> list[Place]:
