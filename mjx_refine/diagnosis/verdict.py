@@ -9,7 +9,7 @@ import numpy as np
 
 from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared
 from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.where import misfit_map
+from mjx_refine.diagnosis.where import background_energy, misfit_map
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +100,7 @@ def best_candidate(compared: Compared) -> Candidate | None:
 
 def unsteadiness(clip: ClipFit, fit) -> float:
     """Mean square residual of the background's flow [noise widths squared]."""
-    return float(misfit_map(clip, fit)[2].mean())
+    return float(background_energy(clip, fit).mean())
 
 
 def structure(clip: ClipFit, fit) -> float:

@@ -30,9 +30,13 @@ def misfit_map(
     moved = np.zeros_like(still)
     moved[:-1] = (parts.flow**2).sum((-1, -2)) / (2 * clip.counts.flow)
     total = np.where(seen, 0.6 * still + 0.4 * moved, 0.0)
-    beside = np.zeros(len(still))
-    beside[:-1] = (parts.background**2).sum((-1, -2)) / (2 * BACKGROUND_COUNT)
-    return total.T, _channels(parts.reach, moved).T, beside
+    return total.T, _channels(parts.reach, moved).T, background_energy(clip, fit)
+
+
+def background_energy(clip: ClipFit, fit: Fit) -> Float[np.ndarray, "frames"]:
+    """Mean square residual of the background's flow by frame [noise widths squared]; zero where a clip has none (poses)."""
+    background = clip.measured.split(fit.residual).background
+    return np.append((background**2).sum((-1, -2)) / (2 * BACKGROUND_COUNT), 0.0)
 
 
 def _channels(reach: np.ndarray, moved: np.ndarray) -> np.ndarray:
