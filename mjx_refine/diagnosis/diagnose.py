@@ -35,6 +35,7 @@ from mjx_refine.observation import Observation
 from mjx_refine.scene import Samples, Scene
 from mjx_refine.search.options import Options
 from mjx_refine.search.problem import Problem, Start
+from mjx_refine.sim.recalled import Recalling
 
 LEAST_FRAMES = 9
 """Frames that a clip must have: fewer cannot be held out."""
@@ -89,7 +90,7 @@ def _diagnosed(
 ) -> Diagnosis:
     began = time.monotonic()
     problem, start, measured = prepared(scene, observation, threads)
-    clip = ClipFit(problem.reference(scene.shapes), measured, observation.size, observation.length)
+    clip = ClipFit(Recalling(problem.reference(scene.shapes)), measured, observation.size, observation.length)
     clip.store, clip.crew = store or clip.store, crew
     crew.warm(clip)
     compared = compare(clip, start.scene, observation, start.matching, without, seed, told)

@@ -26,6 +26,7 @@ from mjx_refine.scene import Shape
 from mjx_refine.search.residuals import slowed
 from mjx_refine.sim.backends import Simulator
 from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.sim.recalled import Recalling
 
 SCALE = 5.0
 """Noise widths beyond which residuals count ever less."""
@@ -396,4 +397,4 @@ class ClipFit:
 
 
 def _made(shapes: tuple[Shape, ...], fps: float, measured: Measured, image, frames: int, threads: int) -> ClipFit:
-    return ClipFit(MujocoSimulator(shapes, fps, threads), measured, image, frames)
+    return ClipFit(Recalling(MujocoSimulator(shapes, fps, threads)), measured, image, frames)

@@ -38,6 +38,7 @@ from mjx_refine.effects.kind import FitView
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene
 from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.sim.recalled import Recalling
 
 _Gap = TypeVar("_Gap", Gap, ClipGap)
 
@@ -92,7 +93,7 @@ class Recordings(SetUp):
         check_once([(one.time, one.position, one.quaternion) for one in poses], self.names)
         # One simulator for all, at the rate of their median sample.
         rate = rate_of(np.cumsum(np.concatenate([np.diff(one.time) for one in poses])))
-        simulator = MujocoSimulator(scenes[0].shapes, rate, threads)
+        simulator = Recalling(MujocoSimulator(scenes[0].shapes, rate, threads))
         self.clips: list[PosesFit] = []
         self.spaces = []
         for scene, one, columns in zip(common_scenes(scenes), poses, self.columns, strict=True):

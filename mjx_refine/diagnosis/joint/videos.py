@@ -34,6 +34,7 @@ from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene
 from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.sim.recalled import Recalling
 
 UNCALIBRATED = "Probabilities were calibrated on single clips: read the evidence and the gap on held-out clips as well."
 
@@ -90,7 +91,7 @@ class Videos(SetUp):
         ready = [prepared(scene, one, threads) for scene, one in zip(scenes, observations, strict=True)]
         self.problems = [problem for problem, _, _ in ready]
         self.matchings = [start.matching for _, start, _ in ready]
-        simulators = {one.fps: MujocoSimulator(scenes[0].shapes, one.fps, threads) for one in observations}
+        simulators = {o.fps: Recalling(MujocoSimulator(scenes[0].shapes, o.fps, threads)) for o in observations}
         self.clips = [
             ClipFit(simulators[one.fps], measured, one.size, one.length)
             for one, (_, _, measured) in zip(observations, ready, strict=True)

@@ -29,6 +29,7 @@ from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene
 from mjx_refine.sim.c import MujocoSimulator
+from mjx_refine.sim.recalled import Recalling
 
 LEAST_TIMES = 9
 """Samples that poses must have: fewer cannot be held out."""
@@ -73,7 +74,7 @@ def diagnose_recording(
     check_poses(scene, poses)
     told = told or (lambda line: None)
     scene = started(scene, poses, columns)
-    clip = PosesFit(MujocoSimulator(scene.shapes, rate_of(poses.time), threads), poses, columns)
+    clip = PosesFit(Recalling(MujocoSimulator(scene.shapes, rate_of(poses.time), threads)), poses, columns)
     clip.store = store or clip.store
     check_motion(clip, poses)
     left_out = (*without, *(name for name, kind in catalogue().items() if not kind.physical))

@@ -1,0 +1,108 @@
+"""Rollouts that are asked for again: kept for a while, since searches come back to where they were."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_refine.batch import SceneBatch
+from mjx_refine.effects.registry import acting_kind
+from mjx_refine.sim.backends import Simulator
+
+KEPT = 96 << 20
+"""Bytes of poses that a process keeps; what was asked for longest ago goes first."""
+
+_SEEN = {"camera_position", "camera_pitch", "camera_fovy"}
+
+
+class Memory:
+    """Poses by fingerprints of what they were asked for with, the latest of them.
+
+    Args:
+      most: bytes of poses that are kept.
+    """
+
+    def __init__(self, most: int = KEPT):
+        self.most = most
+        self._poses: OrderedDict[bytes, np.ndarray] = OrderedDict()
+        self._bytes, self._lock = 0, threading.Lock()
+
+    def recall(self, key: bytes) -> np.ndarray | None:
+        """What was kept under ``key``, if it still is."""
+        with self._lock:
+            if key not in self._poses:
+                return None
+            self._poses.move_to_end(key)
+            return self._poses[key]
+
+    def keep(self, key: bytes, poses: np.ndarray) -> None:
+        """Keeps poses, which are not to be written to any more, and gives up the oldest where they are too many."""
+        poses.flags.writeable = False
+        with self._lock:
+            if key in self._poses or poses.nbytes > self.most:
+                return
+            self._poses[key] = poses
+            self._bytes += poses.nbytes
+            while self._bytes > self.most:
+                self._bytes -= self._poses.popitem(last=False)[1].nbytes
+
+
+_OF_THIS_PROCESS = Memory()
+
+
+class Recalling:
+    """A simulator that gives rollouts that it, or another like it, made lately again for a batch that moves in the same way.
+
+    Least squares that go on where others ended, and effects that only change how a scene is seen, ask for the same rollouts
+    as the fit before them.
+
+    Args:
+      simulator: that makes them; the same batch must always give the same poses, with any number of threads.
+      memory: where they are kept; the process's own by default.
+    """
+
+    def __init__(self, simulator: Simulator, memory: Memory | None = None):
+        self.simulator, self.memory = simulator, memory or _OF_THIS_PROCESS
+        self.name, self.device = simulator.name, simulator.device
+        self.shapes, self.fps = simulator.shapes, simulator.fps
+        self.recalled = 0
+        """Calls that were answered with poses that were there."""
+
+    def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
+        """As the simulator's; not to be written to."""
+        acting = tuple(e for e in batch.effects if (kind := acting_kind(e.name)).physical or kind.retimes)
+        moving = dataclasses.replace(batch, effects=acting)
+        key = self._key(moving, frames)
+        found = self.memory.recall(key)
+        if found is not None:
+            self.recalled += 1
+            return found
+        poses = self.simulator.rollout(moving, frames)
+        self.memory.keep(key, poses)
+        return poses
+
+    def _key(self, batch: SceneBatch, frames: int) -> bytes:
+        """A fingerprint of all that a rollout depends on."""
+        state = hashlib.blake2b(
+            f"{self.name} {self.device} {self.fps!r} {frames} {len(batch)}".encode(), digest_size=16
+        )
+        for part in _parts(batch):
+            state.update(part)
+        return state.digest()
+
+
+def _parts(batch: SceneBatch) -> Iterator[bytes]:
+    yield repr(batch.shapes).encode()
+    for field in dataclasses.fields(batch):
+        value = getattr(batch, field.name)
+        if isinstance(value, np.ndarray) and field.name not in _SEEN:
+            yield np.ascontiguousarray(value).tobytes()
+    for effect in batch.effects:
+        yield f"{effect.name} {effect.target} {effect.values.shape}".encode()
+        yield np.ascontiguousarray(effect.values).tobytes()
