@@ -14,6 +14,9 @@ from mjx_refine.effects.kind import FitView
 from mjx_refine.search.features import DIRECTIONS
 from mjx_refine.view.outline import directions
 
+FEW = 8
+"""Places of the background's flow below which no common motion is told from noise."""
+
 LOUD = 2.0
 """Mean square residual [noise widths squared] from which a frame counts as misfitting."""
 
@@ -34,9 +37,28 @@ def misfit_map(
 
 
 def background_energy(clip: ClipFit, fit: Fit) -> Float[np.ndarray, "frames"]:
-    """Mean square residual of the background's flow by frame [noise widths squared]; zero where a clip has none (poses)."""
+    """Mean square of what the background's flow leaves in common, by frame [noise widths squared]; zero where a clip has none
+    (poses).
+
+    What a camera does moves the whole picture: its residual is, in every frame, a shift, a turn and a stretch of all places
+    together. What flow invents beside a moving object, in shadows and where nothing has texture, is not.
+    """
     background = clip.measured.split(fit.residual).background
-    return np.append((background**2).sum((-1, -2)) / (2 * BACKGROUND_COUNT), 0.0)
+    seen = np.isfinite(clip.measured.background).all(-1)
+    shared = [_shared(row[ok], clip.measured.places[ok]) for row, ok in zip(background, seen, strict=True)]
+    return np.append(np.array(shared) / (2 * BACKGROUND_COUNT), 0.0)
+
+
+def _shared(flow: Float[np.ndarray, "places 2"], places: Float[np.ndarray, "places 2"]) -> float:
+    """Sum of squares of the similarity that is nearest to a flow; what as many numbers of noise have of it is taken off."""
+    if len(flow) < FEW:
+        return 0.0
+    x, y = (places - places.mean(0)).T / np.ptp(places, axis=0).max()
+    one, none = np.ones(len(x)), np.zeros(len(x))
+    design = np.concatenate([np.stack([one, none, -y, x], -1), np.stack([none, one, x, y], -1)])
+    wanted = flow.T.ravel()
+    left = wanted - design @ np.linalg.lstsq(design, wanted, rcond=None)[0]
+    return max(float(wanted @ wanted - left @ left * len(wanted) / (len(wanted) - design.shape[1])), 0.0)
 
 
 def _channels(reach: np.ndarray, moved: np.ndarray) -> np.ndarray:
