@@ -13,10 +13,12 @@ import logging
 import multiprocessing
 import queue
 import signal
+import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -24,6 +26,7 @@ import jax
 from mjx_refine.children import ONE_THREAD, exit_with_parent, inherited, pool, without_main
 from mjx_refine.diagnosis.settled import Settled
 from mjx_refine.diagnosis.store import Arrays, Borrowed, Store
+from mjx_refine.sim import recalled
 
 log = logging.getLogger("mjx_refine")
 
@@ -196,11 +199,18 @@ def crew_of(processes: int) -> Iterator[Crew]:
     if count < 1 or multiprocessing.current_process().daemon:
         yield Crew()
         return
-    with pool(count, _begin, (jax.config.jax_compilation_cache_dir,)) as others:
+    with (
+        tempfile.TemporaryDirectory(prefix="mjx-refine-", ignore_cleanup_errors=True) as rollouts,
+        pool(count, _begin, (jax.config.jax_compilation_cache_dir, rollouts)) as others,
+    ):
         with without_main(), inherited(ONE_THREAD):
             for _ in range(count):
                 others.submit(_begun)
-        yield Crew(others, count)
+        recalled.PROCESS.share(Path(rollouts))
+        try:
+            yield Crew(others, count)
+        finally:
+            recalled.PROCESS.share(None)
 
 
 # --- the other processes ----------------------------------------------------------------------------------------------
@@ -208,9 +218,10 @@ def crew_of(processes: int) -> Iterator[Crew]:
 _BENCH = _Bench()
 
 
-def _begin(cache: str | None) -> None:
+def _begin(cache: str | None, rollouts: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends us
     threading.Thread(target=exit_with_parent, daemon=True).start()
+    recalled.PROCESS.share(Path(rollouts))
     jax.config.update("jax_platforms", "cpu")  # as the parent predicts, and a GPU's memory is not for every process
     if cache is not None:
         jax.config.update("jax_compilation_cache_dir", cache)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +17,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.effects.registry import acting_kind
 from mjx_refine.sim.backends import Simulator
 
-KEPT = 96 << 20
+KEPT = 64 << 20
 """Bytes of poses that a process keeps; what was asked for longest ago goes first."""
 
 _SEEN = {"camera_position", "camera_pitch", "camera_fovy"}
@@ -30,30 +32,57 @@ class Memory:
 
     def __init__(self, most: int = KEPT):
         self.most = most
-        self._poses: OrderedDict[bytes, np.ndarray] = OrderedDict()
+        self._poses: OrderedDict[str, np.ndarray] = OrderedDict()
         self._bytes, self._lock = 0, threading.Lock()
+        self._folder: Path | None = None
 
-    def recall(self, key: bytes) -> np.ndarray | None:
-        """What was kept under ``key``, if it still is."""
+    def share(self, folder: Path | None) -> None:
+        """From now on keeps poses in a folder as well, where others that share it find them; None: no more."""
+        self._folder = folder
+
+    def recall(self, key: str) -> np.ndarray | None:
+        """What was kept under ``key``, here or by others, if it still is."""
         with self._lock:
-            if key not in self._poses:
-                return None
-            self._poses.move_to_end(key)
-            return self._poses[key]
+            if key in self._poses:
+                self._poses.move_to_end(key)
+                return self._poses[key]
+        if self._folder is None:
+            return None
+        try:
+            return np.load(self._folder / f"{key}.npy", allow_pickle=False)
+        except (OSError, ValueError, EOFError):
+            return None
 
-    def keep(self, key: bytes, poses: np.ndarray) -> None:
+    def keep(self, key: str, poses: np.ndarray) -> None:
         """Keeps poses, which are not to be written to any more, and gives up the oldest where they are too many."""
         poses.flags.writeable = False
+        if poses.nbytes > self.most:
+            return
         with self._lock:
-            if key in self._poses or poses.nbytes > self.most:
+            if key in self._poses:
                 return
             self._poses[key] = poses
             self._bytes += poses.nbytes
+            gone = []
             while self._bytes > self.most:
-                self._bytes -= self._poses.popitem(last=False)[1].nbytes
+                gone.append(self._poses.popitem(last=False))
+                self._bytes -= gone[-1][1].nbytes
+        folder = self._folder
+        if folder is None:
+            return
+        try:
+            for name, _ in gone:
+                (folder / f"{name}.npy").unlink(missing_ok=True)
+            part = folder / f"{key}.{os.getpid()}.part"
+            with open(part, "wb") as stream:
+                np.save(stream, poses)
+            part.replace(folder / f"{key}.npy")
+        except OSError:  # a full disk, or a folder that is gone: everyone for himself
+            self._folder = None
 
 
-_OF_THIS_PROCESS = Memory()
+PROCESS = Memory()
+"""Of all simulators in this process."""
 
 
 class Recalling:
@@ -68,7 +97,7 @@ class Recalling:
     """
 
     def __init__(self, simulator: Simulator, memory: Memory | None = None):
-        self.simulator, self.memory = simulator, memory or _OF_THIS_PROCESS
+        self.simulator, self.memory = simulator, memory or PROCESS
         self.name, self.device = simulator.name, simulator.device
         self.shapes, self.fps = simulator.shapes, simulator.fps
         self.recalled = 0
@@ -87,14 +116,14 @@ class Recalling:
         self.memory.keep(key, poses)
         return poses
 
-    def _key(self, batch: SceneBatch, frames: int) -> bytes:
+    def _key(self, batch: SceneBatch, frames: int) -> str:
         """A fingerprint of all that a rollout depends on."""
         state = hashlib.blake2b(
             f"{self.name} {self.device} {self.fps!r} {frames} {len(batch)}".encode(), digest_size=16
         )
         for part in _parts(batch):
             state.update(part)
-        return state.digest()
+        return state.hexdigest()
 
 
 def _parts(batch: SceneBatch) -> Iterator[bytes]:
