@@ -98,7 +98,8 @@ def _differing(found: list[Candidate]) -> list[Candidate]:
 
 
 def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
-    return clip.roam(fit, seed, ROAMED_AGAIN)
+    other = clip.roam(fit, seed, ROAMED_AGAIN)
+    return other if other.evidence > fit.evidence else fit
 
 
 def _gone_on(clip: ClipFit, base: Fit, found: list[Candidate]) -> list[Candidate]:

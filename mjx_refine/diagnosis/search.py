@@ -45,7 +45,8 @@ strikes may cost this multiple, since its impact may not err yet. In eleven clip
 best two families, and all that ended within 60 of the best, were below that."""
 
 ROAMING, HOPELESS = 2, -30.0
-"""How many effects' fits look beyond where least squares ended, and the lead below which none does."""
+"""How many effects' fits look beyond where least squares ended, and the lead below which none does; nor does one as far behind
+the best as those that are left after their first steps."""
 
 CLEAR, KEPT = 40.0, 6
 """Lead of an effect from which the noise is taken anew from what it leaves, and how many effects are fitted again with that."""
@@ -145,7 +146,9 @@ def _singles(
     _from_the_best(clip, base, fitted, names, observation, masks_of, told, scene)
     base, fitted = exchanged(clip, base, fitted)
     first = sorted(fitted, key=lambda key: -fitted[key][0].evidence)[:ROAMING]
-    first = [key for key in first if lead_of(fitted[key][0], base) > HOPELESS]
+    most = max([0.0, *(lead_of(fitted[key][0], base) for key in first)])
+    least = max(HOPELESS, most - max(CLOSE, SOME_OF_IT * most))
+    first = [key for key in first if lead_of(fitted[key][0], base) >= least]
     for key, fit in zip(first, clip.crew.each(clip, _roamed, [(fitted[key][0], seed) for key in first]), strict=True):
         fitted[key] = (fit, fitted[key][1])
     base, fitted = exchanged(clip, base, fitted)
@@ -193,7 +196,9 @@ def _keep(fitted: Fitted, key: Key, fit: Fit, promise: float) -> None:
 
 
 def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
-    return knocked(clip, clip.roam(clip.fit(fit.hypothesis, fit.z, 8), seed, ROAMED_AGAIN))
+    # What costs less may lie in a narrower place, which explains less.
+    other = knocked(clip, clip.roam(clip.fit(fit.hypothesis, fit.z, 8), seed, ROAMED_AGAIN))
+    return other if other.evidence > fit.evidence else fit
 
 
 def _of_own_contacts(clip: ClipFit, base: Fit) -> Fit:
