@@ -85,9 +85,10 @@ def cube() -> Scene:
 def tosses(folder: Path, count: int | None, out: Path, seed: int) -> None:
     """Prints a row a toss."""
     print(
-        "| toss | verdict | first candidate | lead | gap before | after | closed | mm before | after | ° before | after | s |"
+        "| toss | verdict | first candidate | lead | gap before | after | closed | mm before | after | ° before | after "
+        "| plain fit, mm | ° | s |"
     )
-    print("| --- " * 12 + "|", flush=True)
+    print("| --- " * 14 + "|", flush=True)
     found = []
     for path in sorted(folder.glob("toss_*.npz"))[:count]:
         told = diagnose_poses(cube(), toss(path), seed=seed)
