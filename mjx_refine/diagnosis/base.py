@@ -22,7 +22,11 @@ from mjx_refine.space import Space
 from mjx_refine.space.layout import logarithmic, lowest_extent
 from mjx_refine.view.tiles import foreground
 
-RESTING = ("clearance", "tilt")
+RESTING, ROLLING = ("clearance", "tilt"), ("clearance", "lean")
+"""Fields of a pose that are held where a body lies flat on the floor, and where it may roll."""
+
+LEVEL = math.radians(1.5)
+"""Slant up to which a body is thought to lie on a side or along its axis [rad]."""
 
 TRUST = 0.2
 """Width of the prior around the given scene, in errors of a language model: the scene is thought to be refined. Its tails
@@ -51,14 +55,14 @@ def base_space(scene: Scene) -> Space:
     """
     space = Space.around(scene)
     flat = [_lies_flat(scene, i, body) for i, body in enumerate(scene.objects)]
+    rolls = [_lies_round(scene, i, body) for i, body in enumerate(scene.objects)]
     held = np.array(
         [
             p.index[0] >= 0
-            and flat[p.index[0]]
             and (
-                p.field in RESTING
-                or (p.field == "linear_velocity" and p.index[1] == 2)
-                or (p.field == "spin" and p.index[1] < 2)
+                (flat[p.index[0]] and (p.field in RESTING or (p.field == "spin" and p.index[1] < 2)))
+                or (rolls[p.index[0]] and p.field in ROLLING)
+                or ((flat[p.index[0]] or rolls[p.index[0]]) and p.field == "linear_velocity" and p.index[1] == 2)
             )
             for p in space.parameters
         ],
@@ -109,12 +113,24 @@ def grip_notes(fit: Fit) -> list[str]:
 def _lies_flat(scene: Scene, i: int, body: Body) -> bool:
     if body.shape == "sphere":
         return False
+    up = np.abs(rotations.matrix(np.array(body.orientation))[2])
+    level = (up.max() if body.shape == "box" else up[2]) > math.cos(LEVEL)
+    spin = rotations.rotate(np.array(body.orientation), np.array(body.angular_velocity))
+    return level and _on_floor(scene, i, body) and float(np.abs(spin[:2]).max()) < 0.5
+
+
+def _lies_round(scene: Scene, i: int, body: Body) -> bool:
+    if body.shape == "box":
+        return False
+    axis = rotations.matrix(np.array(body.orientation))[2, 2]
+    level = body.shape == "sphere" or abs(float(axis)) < math.sin(LEVEL)
+    return level and _on_floor(scene, i, body)
+
+
+def _on_floor(scene: Scene, i: int, body: Body) -> bool:
     batch = batch_from_scenes([scene])
     gap = body.position[2] - float(lowest_extent(body.shape, batch.size[0, i], batch.quaternion[0, i]))
-    up = np.abs(rotations.matrix(np.array(body.orientation))[2])
-    level = (up.max() if body.shape == "box" else up[2]) > math.cos(math.radians(1.5))
-    spin = rotations.rotate(np.array(body.orientation), np.array(body.angular_velocity))
-    return level and abs(gap) < 0.01 and abs(body.linear_velocity[2]) < 0.1 and float(np.abs(spin[:2]).max()) < 0.5
+    return abs(gap) < 0.01 and abs(body.linear_velocity[2]) < 0.1
 
 
 def stored_base(clip: ClipFit, space: Space, observation: Observation, masks_of: tuple[int, ...]) -> Fit:

@@ -12,6 +12,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.diagnosis.apart import beside
 from mjx_refine.diagnosis.chaos import believed, drawn, jaggedness
 from mjx_refine.diagnosis.crew import Crew
+from mjx_refine.diagnosis.drawn_along import uncertain
 from mjx_refine.diagnosis.fitted import Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
@@ -52,7 +53,7 @@ class ClipFit:
         self.simulator, self.measured, self.image, self.frames = simulator, measured, image, frames
         self.noise = noise or everywhere(measured, frames)
         places, blur = measured.places, measured.blur
-        self.predictor = Predictor(simulator.shapes, measured.pixels, places, image, simulator.fps, blur)
+        self.predictor = Predictor(simulator.shapes, measured.pixels, places, image, simulator.fps, blur, not measured.stated)
         self.rollouts = 0.0
         self.counts = Counts()
         self.store, self.crew = Store(), Crew()
@@ -138,7 +139,10 @@ class ClipFit:
 
     def _loosened(self, batch: SceneBatch, poses: np.ndarray, found: list[Impact], still: Prediction, kicks) -> Loose:
         sharp, marks = self.noise, [(i.target, i.frame) for i in found]
-        return Loose(too_wide(self.measured), kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
+        always = too_wide(self.measured)
+        if self.predictor.drawn:
+            always = Parts(*(np.concatenate(both) for both in zip(always, uncertain(self.measured, still.parts), strict=True)))
+        return Loose(always, kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
 
     def kicks(self, batch: SceneBatch, poses: np.ndarray, still: Prediction, found: list[Impact], part: float) -> Parts:
         """What impacts that err by ``part`` of themselves change in what ``still`` predicts, one standard deviation a row."""

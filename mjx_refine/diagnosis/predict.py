@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.compile_cache import jit_quickly
+from mjx_refine.diagnosis.drawn_along import drawn_along
 from mjx_refine.diagnosis.measure import Parts
 from mjx_refine.effects import acting
 from mjx_refine.effects.kind import OutlineView
@@ -79,6 +80,7 @@ class Predictor:
       image: (width, height) [px].
       fps: frames a second.
       blur: how far from an outline the flow beside it is still much like the object's [px].
+      drawn: whether outlines draw the flow along, as where it was measured.
     """
 
     def __init__(
@@ -89,9 +91,10 @@ class Predictor:
         image: tuple[int, int],
         fps: float,
         blur: float = 0.0,
+        drawn: bool = False,
     ):
         self.shapes, self.pixels, self.places, self.image, self.fps = shapes, pixels, places, image, fps
-        self.blur = blur
+        self.blur, self.drawn = blur, drawn
 
     def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Prediction:
         """The prediction for ``poses`` (of ``Simulator.rollout``) seen with the camera and effects of ``batch``."""
@@ -122,6 +125,8 @@ class Predictor:
             reach = (reach + change)[..., :: count // DIRECTIONS]
             whole = changed_moments(whole, batch, view, change)
             flow = self._seen_flow(flow, batch, focal)
+        if self.drawn:
+            flow = drawn_along(flow, whole)
         background = self._background(batch, len(poses), poses.shape[1])
         wide = acting.overdrawn(batch)
         if wide is not None and (wide > 0).any():
