@@ -1,7 +1,10 @@
 """Measured flow is drawn along by outlines.
 
-A surface that moves across its own outline, as that of a ball that rolls or of a body that tumbles, shows through texture alone, while the outline is an edge against what
-lies behind: what smooths flow, as every method does, takes the surface's motion for more like the outline's than it is.
+A surface that moves across its own outline, as that of a ball that rolls or of a body that tumbles, shows through its texture
+alone; the outline is an edge against what lies behind. Whatever smooths flow takes the surface's motion for more like the
+outline's than it is. Of twelve objects in seven withheld clips without effect (seed 18, OpenCV's DIS) the part that shows of it
+was 0.64 to 0.95, 0.79 in the median. A base model that is held to the whole slips on a floor without friction instead, and then
+explains a wind.
 """
 
 from __future__ import annotations
@@ -10,15 +13,20 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.diagnosis.measure import Measured, Parts
+from mjx_refine.diagnosis.slack import too_wide
 
-SEEN, EACH = 0.8, ((0.15, 0.1), (0.15, 0.1))
-"""Part of the surface's motion against its outline that measured flow shows."""
+SHOWS = 0.8
+"""Part that measured flow shows of a surface's motion against its outline."""
+
+WHOLE, WITHIN = (0.15, 0.1), (0.15, 0.1)
+"""Standard deviations of that part, for an object's mean flow and for what its points differ from it: all the time, and how
+much more at the end than in the middle."""
 
 
 def against(
     flow: Float[np.ndarray, "batch intervals objects points 2"], moments: Float[np.ndarray, "batch frames objects 3"]
 ) -> Float[np.ndarray, "batch intervals objects points 2"]:
-    """Flow of surfaces against their silhouettes' centroids [px/frame]; where those are not seen, against its own mean."""
+    """Flow of surfaces against their silhouettes' centroids, or against its own mean where these are not seen [px/frame]."""
     centroids = np.diff(moments[..., :2], axis=1)
     return flow - np.where(np.isfinite(centroids), centroids, flow.mean(-2))[..., None, :]
 
@@ -26,24 +34,42 @@ def against(
 def drawn_along(
     flow: Float[np.ndarray, "batch intervals objects points 2"], moments: Float[np.ndarray, "batch frames objects 3"]
 ) -> Float[np.ndarray, "batch intervals objects points 2"]:
-    """What is measured of a flow [px/frame]."""
-    return flow - (1 - SEEN) * against(flow, moments)
+    """What is measured of a flow.
+
+    Args:
+      flow: of the surfaces [px/frame].
+      moments: centroids and equivalent radii of the silhouettes [px].
+    """
+    return flow - (1 - SHOWS) * against(flow, moments)
 
 
 def uncertain(measured: Measured, told: Parts) -> Parts:
-    """What measured flow may err by, one standard deviation a row: the motion of each object as a whole and within, from beginning to end, by more at one of them."""
-    objects = told.flow.shape[-3]
-    moved = against(told.flow, told.moments)[0]
-    moved = np.where(np.isfinite(measured.flow), moved, 0.0) / SEEN
-    whole = np.broadcast_to(moved.mean(-2, keepdims=True), moved.shape)
-    time = np.linspace(-1.0, 1.0, len(moved))[:, None, None, None]
+    """What measured flow may err by since nobody knows how far outlines draw it, one standard deviation a row [px].
+
+    Args:
+      measured: what was seen; where nothing was, nothing errs.
+      told: the prediction (batch 1), drawn along.
+    """
+    moved = np.where(np.isfinite(measured.flow), against(told.flow, told.moments)[0], 0.0) / SHOWS
+    mean = np.broadcast_to(moved.mean(-2, keepdims=True), moved.shape)
+    later = np.linspace(-1.0, 1.0, len(moved))[:, None, None, None]
+    courses = (np.ones_like(later), later)
     rows = [
-        part * width * course
-        for part, widths in zip((whole, moved - whole), EACH, strict=True)
-        for width, course in zip(widths, (np.ones_like(time), time), strict=True)
+        width * part * course
+        for part, widths in ((mean, WHOLE), (moved - mean, WITHIN))
+        for width, course in zip(widths, courses, strict=True)
     ]
-    result = Parts(*(np.zeros((len(rows) * objects, *part.shape)) for part in measured.parts))
-    for k, row in enumerate(rows):
-        for n in range(objects):
-            result.flow[k * objects + n, :, n] = np.nan_to_num(row[:, n])
-    return result
+    objects = moved.shape[1]
+    flow = np.zeros((len(rows), objects, *moved.shape))
+    for n in range(objects):
+        flow[:, n, :, n] = np.nan_to_num(np.stack(rows)[:, :, n])
+    return Parts(*(np.zeros((len(rows) * objects, *part.shape)) for part in measured.parts))._replace(
+        flow=flow.reshape(-1, *moved.shape)
+    )
+
+
+def always_off(measured: Measured, told: Parts, drawn: bool) -> Parts:
+    """What measurements may err by whatever contacts do, one standard deviation a row [px]; ``drawn``: whether outlines draw
+    the flow along."""
+    wide = too_wide(measured)
+    return wide.beside(uncertain(measured, told)) if drawn else wide

@@ -12,7 +12,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.diagnosis.apart import beside
 from mjx_refine.diagnosis.chaos import believed, drawn, jaggedness
 from mjx_refine.diagnosis.crew import Crew
-from mjx_refine.diagnosis.drawn_along import uncertain
+from mjx_refine.diagnosis.drawn_along import always_off
 from mjx_refine.diagnosis.fitted import Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
@@ -21,7 +21,7 @@ from mjx_refine.diagnosis.pace import STEPS, Standing, descended
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.roam import GENERATIONS, ROAMED, Strategy
 from mjx_refine.diagnosis.settled import Loose, Settled
-from mjx_refine.diagnosis.slack import PART, Contacts, Impact, Slack, Slacks, contacts, kicked, too_wide
+from mjx_refine.diagnosis.slack import PART, Contacts, Impact, Slack, Slacks, contacts, kicked
 from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
 from mjx_refine.scene import Shape
 from mjx_refine.search.residuals import slowed
@@ -52,12 +52,10 @@ class ClipFit:
     ):
         self.simulator, self.measured, self.image, self.frames = simulator, measured, image, frames
         self.noise = noise or everywhere(measured, frames)
-        places, blur = measured.places, measured.blur
-        self.predictor = Predictor(simulator.shapes, measured.pixels, places, image, simulator.fps, blur, not measured.stated)
-        self.rollouts = 0.0
-        self.counts = Counts()
+        places, blur, drawn = measured.places, measured.blur, measured.drawn
+        self.predictor = Predictor(simulator.shapes, measured.pixels, places, image, simulator.fps, blur, drawn)
+        self.rollouts, self.counts, self.slackness = 0.0, Counts(), 1.0
         self.store, self.crew = Store(), Crew()
-        self.slackness = 1.0
         self._loose: Loose | None = None
         self._columns: np.ndarray | None = None
         self._slacks = Slacks()
@@ -139,9 +137,7 @@ class ClipFit:
 
     def _loosened(self, batch: SceneBatch, poses: np.ndarray, found: list[Impact], still: Prediction, kicks) -> Loose:
         sharp, marks = self.noise, [(i.target, i.frame) for i in found]
-        always = too_wide(self.measured)
-        if self.predictor.drawn:
-            always = Parts(*(np.concatenate(both) for both in zip(always, uncertain(self.measured, still.parts), strict=True)))
+        always = always_off(self.measured, still.parts, self.predictor.drawn)
         return Loose(always, kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
 
     def kicks(self, batch: SceneBatch, poses: np.ndarray, still: Prediction, found: list[Impact], part: float) -> Parts:

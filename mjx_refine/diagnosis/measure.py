@@ -56,6 +56,10 @@ class Parts(NamedTuple):
         """All in one row for each entry of the leading axis."""
         return np.concatenate([part.reshape(len(part), -1) for part in self], 1)
 
+    def beside(self, others: Parts) -> Parts:
+        """These rows, and then others."""
+        return Parts(*(np.concatenate(both) for both in zip(self, others, strict=True)))
+
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
@@ -74,6 +78,8 @@ class Measured:
       moment_noise: of ``moments``, by object [px].
       background_noise: of ``background`` [px].
       stated: whether the clip says how noisy its flow is.
+      drawn: whether the flow was measured, and so drawn along by outlines: its noise is not stated, or by pixel, as only a
+        measurement's is.
     """
 
     reach: Float[np.ndarray, "frames objects directions"]
@@ -88,6 +94,7 @@ class Measured:
     moment_noise: Float[np.ndarray, "objects 3"]
     background_noise: float
     stated: bool
+    drawn: bool = False
 
     @functools.cached_property
     def freshness(self) -> Float[np.ndarray, "frames objects"]:
@@ -168,6 +175,7 @@ def measure(observation: Observation, columns: tuple[int, ...], near: int = BESI
         moment_noise=np.stack([np.maximum(_roughness(moments[..., k : k + 1]), MOMENT_FLOOR) for k in range(3)], -1),
         background_noise=max(1.5 * _spread(background), given / 3, 0.05),
         stated=sigma is not None,
+        drawn=sigma is None or np.ndim(sigma) > 0,
     )
 
 

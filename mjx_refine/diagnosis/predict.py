@@ -80,7 +80,7 @@ class Predictor:
       image: (width, height) [px].
       fps: frames a second.
       blur: how far from an outline the flow beside it is still much like the object's [px].
-      drawn: whether outlines draw the flow along, as where it was measured.
+      drawn: whether outlines draw the flow along, as they do where it was measured.
     """
 
     def __init__(
