@@ -14,6 +14,7 @@ from mjx_refine.diagnosis.diagnose import prepared
 from mjx_refine.diagnosis.drawn_along import SHOWS, WHOLE, WITHIN, against, drawn_along, uncertain
 from mjx_refine.diagnosis.fit import ClipFit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.verdict import Signs, answer
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene
@@ -124,3 +125,13 @@ def test_a_cylinder_on_its_side_is_held_and_a_slanting_one_is_not():
         return set(base_space(dataclasses.replace(ROLLING, objects=(cylinder,))).names)
 
     assert names(0.2) - names(0.0) == {"roller.clearance", "roller.tilt", "roller.velocity.z"}
+
+
+def test_less_of_a_lead_is_asked_for_where_flow_was_measured():
+    told = Signs(
+        lead=60.0, margin=30.0, pair=0.0, before=1.2, after=0.9, structure_before=2.0, structure_after=0.6,
+        held_out=20.0, whole=1.2, closed=0.6,
+    )  # fmt: skip
+    assert answer(told, [60.0], video=True).kind == "none"
+    assert answer(dataclasses.replace(told, drawn=1.0), [60.0], video=True).kind == "single"
+    assert answer(dataclasses.replace(told, drawn=1.0, lead=40.0), [40.0], video=True).kind == "none"
