@@ -134,7 +134,7 @@ def test_two_effects_are_beside_each_other_where_one_of_them_moves_the_camera(mo
 )
 def test_what_nothing_else_looks_like_is_unmistakable_where_it_leads_by_far(monkeypatch, name, behind, sure):
     without_residuals(monkeypatch)
-    clip = SimpleNamespace(misfit=lambda fit: 2.0, expected=lambda: 100.0)
+    clip = SimpleNamespace(misfit=lambda fit: 2.0, expected=lambda: 100.0, measured=SimpleNamespace(drawn=False))
     base = SimpleNamespace(data=400.0)
     one, other = (SimpleNamespace(fit=base, lead=lead, names=(n,)) for lead, n in ((400.0, name), (behind, "shape")))
     assert (
