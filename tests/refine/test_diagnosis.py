@@ -100,7 +100,7 @@ def test_closed_is_what_is_left_of_the_gap():
 
 def test_what_the_background_shows_counts_whatever_effect_leads_a_little(monkeypatch):
     without_residuals(monkeypatch)
-    clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0)
+    clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0, measured=SimpleNamespace(drawn=False))
     base = SimpleNamespace(data=400.0)
     one = SimpleNamespace(fit=base, lead=22.0, names=("slope",))
     told = signs(clip, SimpleNamespace(base=base, candidates=(one,), pairs=(), freed=None), 0.0)
@@ -110,7 +110,7 @@ def test_what_the_background_shows_counts_whatever_effect_leads_a_little(monkeyp
 
 def test_two_effects_are_beside_each_other_where_one_of_them_moves_the_camera(monkeypatch):
     without_residuals(monkeypatch)
-    clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0)
+    clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0, measured=SimpleNamespace(drawn=False))
 
     def fitted(*names):
         terms = [SimpleNamespace(name=name) for name in names]

@@ -88,7 +88,7 @@ def test_what_explains_more_without_a_name_is_unknown(changes, kind, forced):
 @pytest.mark.parametrize("on_floor", [MOSTLY - 0.1, MOSTLY + 0.1])
 def test_its_gain_is_over_the_best_hypothesis(monkeypatch, on_floor):
     without_residuals(monkeypatch)
-    clip = SimpleNamespace(misfit=lambda fit: 2.0, expected=lambda: 100.0)
+    clip = SimpleNamespace(misfit=lambda fit: 2.0, expected=lambda: 100.0, measured=SimpleNamespace(drawn=False))
     base = SimpleNamespace(data=400.0, evidence=-500.0)
     one = SimpleNamespace(fit=SimpleNamespace(evidence=-300.0, data=200.0), lead=200.0, names=("push",))
     freed = Freed(SimpleNamespace(evidence=-260.0), on_floor)  # type: ignore[arg-type]
