@@ -18,9 +18,9 @@ TAIL = 6.0
 """Prior widths beyond which moving a base parameter costs ever less: half its price is TAIL^2 log(1 + (z / TAIL)^2). Nearer
 tails let size, camera and velocity bend until they imitate an effect."""
 
-CONTACTS, CONTACT_TAIL = ("friction", "resistance", "grip"), 2.0
-"""Fields whose first number means something else in every engine, and on every real floor, and its tail. Rolling friction is
-not among them: with twenty times as much a cylinder that meets an obstacle was a cylinder that the floor stops."""
+CONTACTS, CONTACT_TAIL, ROLLING_TAIL = ("friction", "resistance", "grip"), 2.0, 5.0
+"""Fields that mean something else in every engine, and on every real floor, and their tail; that of rolling friction is farther
+off: with twenty times as much a cylinder that meets an obstacle was a cylinder that the floor stops."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +114,8 @@ class Hypothesis:
     @functools.cached_property
     def tails(self) -> Float[np.ndarray, "dimension"]:
         """Prior widths beyond which moving each coordinate costs ever less; infinite for effects, whose prior is normal."""
-        told = [CONTACT_TAIL if p.field in CONTACTS and p.index[1] == 0 else TAIL for p in self.space.parameters]
+        contact = (CONTACT_TAIL, ROLLING_TAIL)
+        told = [contact[p.index[1]] if p.field in CONTACTS else TAIL for p in self.space.parameters]
         return np.concatenate([told, np.full(self.dimension - len(told), np.inf)])
 
     @property
