@@ -22,8 +22,9 @@ from mjx_refine.space import Space
 from mjx_refine.space.layout import logarithmic, lowest_extent
 from mjx_refine.view.tiles import foreground
 
-RESTING, ROLLING = ("clearance", "tilt"), ("clearance", "lean")
-"""Fields of a pose that are held where a body lies flat on the floor, and where it may roll."""
+FLAT = {("clearance", 0), ("tilt", 0), ("tilt", 1), ("linear_velocity", 2), ("spin", 0), ("spin", 1)}
+ROUND = {("clearance", 0), ("lean", 0), ("linear_velocity", 2)}
+"""Fields of a body, and which of their numbers, that are held where it lies flat on the floor, and where it may roll."""
 
 LEVEL = math.radians(1.5)
 """Slant up to which a body is thought to lie on a side or along its axis [rad]."""
@@ -54,20 +55,8 @@ def base_space(scene: Scene) -> Space:
     them to explain other things.
     """
     space = Space.around(scene)
-    flat = [_lies_flat(scene, i, body) for i, body in enumerate(scene.objects)]
-    rolls = [_lies_round(scene, i, body) for i, body in enumerate(scene.objects)]
-    held = np.array(
-        [
-            p.index[0] >= 0
-            and (
-                (flat[p.index[0]] and (p.field in RESTING or (p.field == "spin" and p.index[1] < 2)))
-                or (rolls[p.index[0]] and p.field in ROLLING)
-                or ((flat[p.index[0]] or rolls[p.index[0]]) and p.field == "linear_velocity" and p.index[1] == 2)
-            )
-            for p in space.parameters
-        ],
-        bool,
-    )
+    fixed = [_held_on_floor(scene, i, body) for i, body in enumerate(scene.objects)]
+    held = np.array([i >= 0 and (p.field, k) in fixed[i] for p in space.parameters for i, k in [p.index]], bool)
     space = space.freeze(held, space.start, "it lies on the floor") if held.any() else space
     return _scaled(space, TRUST)
 
@@ -110,27 +99,18 @@ def grip_notes(fit: Fit) -> list[str]:
     return told
 
 
-def _lies_flat(scene: Scene, i: int, body: Body) -> bool:
-    if body.shape == "sphere":
-        return False
-    up = np.abs(rotations.matrix(np.array(body.orientation))[2])
-    level = (up.max() if body.shape == "box" else up[2]) > math.cos(LEVEL)
-    spin = rotations.rotate(np.array(body.orientation), np.array(body.angular_velocity))
-    return level and _on_floor(scene, i, body) and float(np.abs(spin[:2]).max()) < 0.5
-
-
-def _lies_round(scene: Scene, i: int, body: Body) -> bool:
-    if body.shape == "box":
-        return False
-    axis = rotations.matrix(np.array(body.orientation))[2, 2]
-    level = body.shape == "sphere" or abs(float(axis)) < math.sin(LEVEL)
-    return level and _on_floor(scene, i, body)
-
-
-def _on_floor(scene: Scene, i: int, body: Body) -> bool:
+def _held_on_floor(scene: Scene, i: int, body: Body) -> set[tuple[str, int]]:
+    """What of a body is held since it lies on the floor, flat or round; nothing where it does not."""
     batch = batch_from_scenes([scene])
     gap = body.position[2] - float(lowest_extent(body.shape, batch.size[0, i], batch.quaternion[0, i]))
-    return abs(gap) < 0.01 and abs(body.linear_velocity[2]) < 0.1
+    if abs(gap) >= 0.01 or abs(body.linear_velocity[2]) >= 0.1:
+        return set()
+    up = np.abs(rotations.matrix(np.array(body.orientation))[2])
+    if body.shape == "sphere" or (body.shape == "cylinder" and up[2] < math.sin(LEVEL)):
+        return ROUND
+    spin = rotations.rotate(np.array(body.orientation), np.array(body.angular_velocity))
+    level = (up.max() if body.shape == "box" else up[2]) > math.cos(LEVEL)
+    return FLAT if level and float(np.abs(spin[:2]).max()) < 0.5 else set()
 
 
 def stored_base(clip: ClipFit, space: Space, observation: Observation, masks_of: tuple[int, ...]) -> Fit:

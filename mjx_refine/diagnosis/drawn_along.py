@@ -2,9 +2,9 @@
 
 A surface that moves across its own outline, as that of a ball that rolls or of a body that tumbles, shows through its texture
 alone; the outline is an edge against what lies behind. Whatever smooths flow takes the surface's motion for more like the
-outline's than it is. Of twelve objects in seven withheld clips without effect (seed 18, OpenCV's DIS) the part that shows of it
-was 0.64 to 0.95, 0.79 in the median. A base model that is held to the whole slips on a floor without friction instead, and then
-explains a wind.
+outline's than it is. Of ten objects in six withheld clips without effect (seed 18, OpenCV's DIS) the part that shows of it was
+0.63 to 0.95, 0.76 in the median. Held to the whole, base models of five of six clips slipped on floors of hardly any friction
+instead, and one of these explained a wind.
 """
 
 from __future__ import annotations
@@ -59,17 +59,15 @@ def uncertain(measured: Measured, told: Parts) -> Parts:
         for part, widths in ((mean, WHOLE), (moved - mean, WITHIN))
         for width, course in zip(widths, courses, strict=True)
     ]
-    objects = moved.shape[1]
-    flow = np.zeros((len(rows), objects, *moved.shape))
-    for n in range(objects):
-        flow[:, n, :, n] = np.nan_to_num(np.stack(rows)[:, :, n])
-    return Parts(*(np.zeros((len(rows) * objects, *part.shape)) for part in measured.parts))._replace(
-        flow=flow.reshape(-1, *moved.shape)
-    )
+    each = np.nan_to_num(np.stack(rows))
+    objects = np.arange(moved.shape[1])
+    flow = np.zeros((len(rows), len(objects), *moved.shape))
+    flow[:, objects, :, objects] = np.moveaxis(each, 2, 0)
+    blank = (np.zeros((len(rows) * len(objects), *part.shape)) for part in measured.parts)
+    return Parts(*blank)._replace(flow=flow.reshape(-1, *moved.shape))
 
 
-def always_off(measured: Measured, told: Parts, drawn: bool) -> Parts:
-    """What measurements may err by whatever contacts do, one standard deviation a row [px]; ``drawn``: whether outlines draw
-    the flow along."""
+def always_off(measured: Measured, told: Parts) -> Parts:
+    """What measurements may err by whatever contacts do, one standard deviation a row [px]; ``told``: the prediction."""
     wide = too_wide(measured)
-    return wide.beside(uncertain(measured, told)) if drawn else wide
+    return wide.beside(uncertain(measured, told)) if measured.drawn else wide

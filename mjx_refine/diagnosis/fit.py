@@ -52,8 +52,8 @@ class ClipFit:
     ):
         self.simulator, self.measured, self.image, self.frames = simulator, measured, image, frames
         self.noise = noise or everywhere(measured, frames)
-        places, blur, drawn = measured.places, measured.blur, measured.drawn
-        self.predictor = Predictor(simulator.shapes, measured.pixels, places, image, simulator.fps, blur, drawn)
+        m = measured
+        self.predictor = Predictor(simulator.shapes, m.pixels, m.places, image, simulator.fps, m.blur, m.drawn)
         self.rollouts, self.counts, self.slackness = 0.0, Counts(), 1.0
         self.store, self.crew = Store(), Crew()
         self._loose: Loose | None = None
@@ -137,7 +137,7 @@ class ClipFit:
 
     def _loosened(self, batch: SceneBatch, poses: np.ndarray, found: list[Impact], still: Prediction, kicks) -> Loose:
         sharp, marks = self.noise, [(i.target, i.frame) for i in found]
-        always = always_off(self.measured, still.parts, self.predictor.drawn)
+        always = always_off(self.measured, still.parts)
         return Loose(always, kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
 
     def kicks(self, batch: SceneBatch, poses: np.ndarray, still: Prediction, found: list[Impact], part: float) -> Parts:

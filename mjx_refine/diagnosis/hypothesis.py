@@ -20,7 +20,7 @@ tails let size, camera and velocity bend until they imitate an effect."""
 
 CONTACTS, CONTACT_TAIL, ROLLING_TAIL = ("friction", "resistance", "grip"), 2.0, 5.0
 """Fields that mean something else in every engine, and on every real floor, and their tail; that of rolling friction is farther
-off: with twenty times as much a cylinder that meets an obstacle was a cylinder that the floor stops."""
+off: with numbers 19 and 29 widths off two cylinders that met obstacles (seed 18, 039 and 043) were stopped by the floor."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -149,7 +149,7 @@ to 109 for slopes, winds and wide masks, by residuals of a structure of 0.7 to 3
 
 ASKED_OF_MEASURED_FLOW = 45.0
 """The lead that is asked for in their place of one video whose flow was measured: it weighs less, and in 24 videos without effect
-of seeds 15 to 18 of the withheld exams the best effect led by 24 at most."""
+of seeds 15 to 18 of the withheld exams the best effect led by 24 at most (by versions with other tails of rolling friction)."""
 
 INIMITABLE, ASKED = ("camera_motion", "camera_shake", "lens_distortion", "rolling_shutter"), 40.0
 """Effects that contacts which err do not imitate, and the lead that is asked for where one of them is the best: in 42 videos
