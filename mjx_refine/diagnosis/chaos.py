@@ -15,9 +15,8 @@ DRAWS = 12
 NEARBY = 5
 """Frames over which is averaged what a fit leaves."""
 
-EXCUSED = 2.0
-"""Multiple of what a fit leaves up to which jaggedness is believed: all features of a body err together after an impact, and
-count as if each erred alone."""
+EXCUSED = 0.7
+"""Multiple of what a fit leaves up to which jaggedness is believed: what it leaves holds the effect that is looked for, too."""
 
 
 def drawn(

@@ -20,7 +20,7 @@ EDGE_COUNTS, FLOW_COUNTS = (3.0, 6.0), (1.5, 10.0)
 LEAST_EDGE = 0.12
 """Noise of outlines that is assumed at least [px]."""
 
-BLUR = 0.2
+BLUR = 0.05
 """How uncertain the moment of an impact is [frames]: contacts last, and how long is the engine's choice."""
 
 LEAST_MOMENT = 0.03

@@ -32,6 +32,13 @@ LEAST = 0.25
 MOST = 8
 """Impacts an object that are looked at, strongest first."""
 
+SPUN = 3.0
+"""Change of spin, times the size, that friction with the floor makes at most, as a multiple of what it changes velocity by: 2.5
+for a ball, 2 for a cylinder that rolls."""
+
+STEADY = 0.1
+"""How far from gravity's the change of velocity that holds a body up on the floor is in a frame [m/s]."""
+
 FELT = 0.2
 """Error in noise widths below which nobody would see it."""
 
@@ -141,21 +148,39 @@ def too_wide(measured: Measured) -> Parts:
 
 
 def impacts(batch: SceneBatch, poses: Float[np.ndarray, "frames objects 7"], fps: float) -> list[Impact]:
-    """Impacts of a fitted rollout: where velocity or spin jump by more than gravity does."""
+    """Impacts of a fitted rollout: where velocity or spin jump by more than gravity, and friction with the floor, make them."""
     velocity = np.diff(poses[..., :3], axis=0) * fps
     spin = spins(poses, fps)
     jump = np.diff(velocity, axis=0) - batch.gravity[0] / fps
     twist = np.diff(spin, axis=0)
+    fall, on_floor = float(np.linalg.norm(batch.gravity[0])) / fps, touching(batch, poses)
+    stays = on_floor[:-2] & on_floor[1:-1] & on_floor[2:]
     found = []
     for n in range(poses.shape[1]):
         size = float(batch.size[0, n].max())
         change, turn = np.linalg.norm(jump[:, n], axis=-1), np.linalg.norm(twist[:, n], axis=-1) * size
-        # A body at rest on the floor is held against gravity in every frame: that is no impact.
-        held = np.abs(change - np.linalg.norm(batch.gravity[0]) / fps) < 0.1
-        strength = np.where(held, 0.0, change) + 0.5 * turn
+        rubbed = _beyond_friction(jump[:, n], turn, fall, float(batch.friction[0, n, 0]))
+        strength = np.where(stays[:, n], rubbed, change + 0.5 * turn)
         frames = [t for t in np.argsort(-strength) if strength[t] > LEAST][:MOST]
         found += [Impact(n, int(t) + 1, float(change[t]), float(turn[t])) for t in frames]
     return found
+
+
+def _beyond_friction(
+    jump: Float[np.ndarray, "jumps 3"], turn: Float[np.ndarray, "jumps"], fall: float, friction: float
+) -> Float[np.ndarray, "jumps"]:
+    """How much stronger jumps are than what the floor does in every frame to a body that lies, slides or rolls on it [m/s].
+
+    Args:
+      jump: of velocity, without gravity's [m/s].
+      turn: of spin, times the body's size [m/s].
+      fall: change of velocity that gravity makes in a frame [m/s].
+      friction: with the floor.
+    """
+    along, up = np.linalg.norm(jump[:, :2], axis=-1), np.abs(jump[:, 2])
+    rubs = friction * fall
+    beyond = np.hypot(np.maximum(along - rubs, 0.0), np.maximum(np.abs(up - fall) - STEADY, 0.0))
+    return beyond + 0.5 * np.maximum(turn - SPUN * rubs, 0.0)
 
 
 def contacts(

@@ -16,7 +16,7 @@ from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
 from mjx_refine.diagnosis.measure import Measured, Parts
-from mjx_refine.diagnosis.noise import BLUR, Counts, Noise
+from mjx_refine.diagnosis.noise import Counts, Noise
 from mjx_refine.diagnosis.pace import STEPS
 from mjx_refine.diagnosis.poses.data import Poses, noise_of, rotation_vector
 from mjx_refine.diagnosis.predict import Prediction
@@ -35,6 +35,9 @@ frame are then about a video's, and parabolas between frames are exact in flight
 
 PATIENCE = 6.0
 """Multiples of the robust loss's scale: a tracked pose is seldom wild, and a misfit of centimetres must be felt."""
+
+LATE = 0.2 / VIDEO
+"""How uncertain the moment of an impact is [s]: laboratories' floors are no engine's."""
 
 UNSEEN_TURN = 3.0
 """Standard deviation of a turn that a picture would not show (of a sphere, of a cylinder about its axis), and that no
@@ -190,7 +193,7 @@ class PosesFit(ClipFit):
         for one in found:
             near = np.abs(self.time - one.frame / self.simulator.fps) < 2.0 / VIDEO
             size = float(batch.size[0, one.target].max())
-            late = factor * BLUR / VIDEO
+            late = factor * LATE
             moments[near, one.target] = np.hypot(moments[near, one.target], late * one.change)
             edge[near, one.target] = np.hypot(edge[near, one.target], late * one.turn / size)
         return dataclasses.replace(sharp, edge=edge, moments=moments)
