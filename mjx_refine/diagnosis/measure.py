@@ -172,11 +172,16 @@ def measure(observation: Observation, columns: tuple[int, ...], near: int = BESI
         present=present,
         edge_noise=np.maximum(_roughness(reach), EDGE_FLOOR),
         flow_noise=_flow_noise(pixels[:-1, chosen], flow, given),
-        moment_noise=np.stack([np.maximum(_roughness(moments[..., k : k + 1]), MOMENT_FLOOR) for k in range(3)], -1),
+        moment_noise=moment_roughness(moments),
         background_noise=max(1.5 * _spread(background), given / 3, 0.05),
         stated=sigma is not None,
         drawn=sigma is None or np.ndim(sigma) > 0,
     )
+
+
+def moment_roughness(moments: Float[np.ndarray, "frames objects 3"]) -> Float[np.ndarray, "objects 3"]:
+    """Noise of centroids and equivalent radii, from their third differences in time [px]."""
+    return np.stack([np.maximum(_roughness(moments[..., k : k + 1]), MOMENT_FLOOR) for k in range(3)], -1)
 
 
 def _roughness(reach: Float[np.ndarray, "frames objects directions"]) -> Float[np.ndarray, "objects"]:

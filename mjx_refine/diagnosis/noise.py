@@ -8,7 +8,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from mjx_refine.diagnosis.measure import Measured, Parts
+from mjx_refine.diagnosis.measure import Measured, Parts, moment_roughness
 
 EDGE_COUNT, FLOW_COUNT, BACKGROUND_COUNT = 6.0, 3.0, 6.0
 """As how many independent numbers the directions of one outline, the flow of one mask (each axis) and that of the
@@ -22,6 +22,10 @@ LEAST_EDGE = 0.12
 
 BLUR = 0.05
 """How uncertain the moment of an impact is [frames]: contacts last, and how long is the engine's choice."""
+
+MORE_THAN_ROUGH = 1.25
+"""Multiple of what third differences of centroids themselves tell of their noise that it may be at most: what residuals tell of it
+holds what the model lacks, too."""
 
 LEAST_MOMENT = 0.03
 """Noise of centroids and equivalent radii that is assumed at least [px]."""
@@ -123,6 +127,7 @@ def settled(measured: Measured, residual: Parts, counts: Counts, order: int = 1)
     flow = m.flow_noise * np.clip(rough(residual.flow, m.flow, share[1]), 0.7, 3.0)
     each = [rough(residual.moments[..., k], m.moments[..., k], share[2]) for k in range(3)]
     moments = m.moment_noise * np.clip(np.stack(each, -1), 0.6, 3.0)
+    moments = np.minimum(moments, MORE_THAN_ROUGH * moment_roughness(m.moments))
     edge_count = float(np.clip(_independent(np.diff(residual.reach, axis=0)), *EDGE_COUNTS))
     told = float(np.clip(_independent(np.moveaxis(np.diff(residual.flow, axis=0), -1, -2)), *FLOW_COUNTS))
     # Flow whose noise is not stated was measured, and errs smoothly in time as well.
