@@ -24,8 +24,8 @@ BLUR = 0.05
 """How uncertain the moment of an impact is [frames]: contacts last, and how long is the engine's choice."""
 
 MORE_THAN_ROUGH = 1.25
-"""Multiple of what third differences of centroids themselves tell of their noise that it may be at most: what residuals tell of it
-holds what the model lacks, too."""
+"""Multiple of what third differences of centroids themselves tell of their noise that it may be at most: what residuals tell
+of it holds what the model lacks, too."""
 
 LEAST_MOMENT = 0.03
 """Noise of centroids and equivalent radii that is assumed at least [px]."""
