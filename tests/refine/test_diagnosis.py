@@ -164,9 +164,9 @@ SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
         ({"pair": 55.0, "structure_first": 9.0, "inimitable": 1.0}, "single"),
         ({"pair": 45.0, "beside": 1.0}, "pair"),
         ({"pair": 35.0, "beside": 1.0}, "single"),
-        ({"lead": 110.0, "structure_before": 3.9}, "none"),
-        ({"lead": 60.0, "structure_before": 4.1}, "single"),
-        ({"lead": 130.0, "structure_before": 1.9}, "single"),
+        ({"lead": 55.0, "structure_before": 3.9}, "none"),
+        ({"lead": 35.0, "structure_before": 4.1}, "single"),
+        ({"lead": 65.0, "structure_before": 1.9}, "single"),
         ({"lead": 50.0, "structure_before": 1.9, "inimitable": 1.0}, "single"),
         ({"lead": 35.0, "structure_before": 9.0, "inimitable": 1.0}, "none"),
         ({"lead": 3000.0, "pair": 200.0, "beside": 1.0}, "pair"),
@@ -202,8 +202,8 @@ SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
         ({"closed": 0.05}, "unknown"),
         ({"closed": 0.05, "pair": 200.0}, "unknown"),
         ({"closed": 0.05, "lead": 20.0}, "none"),
-        ({"closed": 0.05, "lead": 110.0}, "none"),
-        ({"closed": 0.05, "lead": 110.0, "structure_after": 1.4}, "unknown"),
+        ({"closed": 0.05, "lead": 55.0}, "none"),
+        ({"closed": 0.05, "lead": 55.0, "structure_after": 1.4}, "unknown"),
     ],
 )
 def test_the_answer_follows_the_signs(changes, kind):

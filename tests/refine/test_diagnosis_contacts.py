@@ -47,6 +47,17 @@ def test_an_impact_that_happens_anyway_stays_one():
     assert any(abs(one.frame - bounce.frame) <= 1 for one in found)
 
 
+def test_what_friction_does_to_a_sliding_or_rolling_body_is_no_impact():
+    (crate,) = SLIDE.objects
+    rough = dataclasses.replace(SLIDE, objects=(dataclasses.replace(crate, friction=(1.2, 0.01)),))
+    batch, poses = path(rough)
+    speed = np.linalg.norm(np.diff(poses[:, 0, :3], axis=0), axis=-1) * FPS
+    assert (speed[:-1] - speed[1:]).max() > 0.25  # More than an impact's least change of velocity.
+    assert impacts(batch, poses, FPS) == []
+    push = Effect("push", crate.name, (("time", 0.2), ("x", 0.0), ("y", 2.0), ("z", 0.0)))
+    assert [one.frame for one in impacts(*path(rough, (push,)), FPS)][:1] == [6]
+
+
 def test_bodies_touch_a_tilted_floor():
     slope = Effect("slope", None, (("x", 0.0), ("y", 5.0)))
     batch, poses = path(SLIDE, (slope,))

@@ -129,9 +129,9 @@ def test_a_cylinder_on_its_side_is_held_and_a_slanting_one_is_not():
 
 def test_less_of_a_lead_is_asked_for_where_flow_was_measured():
     told = Signs(
-        lead=60.0, margin=30.0, pair=0.0, before=1.2, after=0.9, structure_before=2.0, structure_after=0.6,
+        lead=50.0, margin=30.0, pair=0.0, before=1.2, after=0.9, structure_before=2.0, structure_after=0.6,
         held_out=20.0, whole=1.2, closed=0.6,
     )  # fmt: skip
-    assert answer(told, [60.0], video=True).kind == "none"
-    assert answer(dataclasses.replace(told, drawn=1.0), [60.0], video=True).kind == "single"
+    assert answer(told, [50.0], video=True).kind == "none"
+    assert answer(dataclasses.replace(told, drawn=1.0), [50.0], video=True).kind == "single"
     assert answer(dataclasses.replace(told, drawn=1.0, lead=40.0), [40.0], video=True).kind == "none"

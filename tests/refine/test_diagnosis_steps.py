@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_diagnosis import FLIGHT, clip_of
+from test_diagnosis_replay import started
 
 from mjx_refine.diagnosis.chaos import DRAWS, EXCUSED, believed, drawn, jaggedness
 from mjx_refine.diagnosis.crew import Crew
@@ -12,7 +14,8 @@ from mjx_refine.diagnosis.diagnose import tied
 from mjx_refine.diagnosis.exchange import at_least_nothing, exchanged
 from mjx_refine.diagnosis.fitted import Fit
 from mjx_refine.diagnosis.hypothesis import term
-from mjx_refine.diagnosis.measure import Parts
+from mjx_refine.diagnosis.measure import Parts, moment_roughness
+from mjx_refine.diagnosis.noise import Counts, settled
 from mjx_refine.diagnosis.pace import ATTEMPTS, STEPS, damped, descended, updated
 from mjx_refine.diagnosis.roam import Strategy
 
@@ -241,3 +244,16 @@ def test_numbers_of_an_effect_that_do_each_others_work_are_told(likeness, told):
     sentences = tied(fit)
     assert len(sentences) == told
     assert all(line.startswith("linear and quadratic of drag") for line in sentences)
+
+
+def test_centroids_are_not_noisier_than_their_own_third_differences():
+    clip = clip_of(FLIGHT, frames=20)
+    fit_of = started(FLIGHT, clip)[2]
+    generator = np.random.default_rng(0)
+    measured = fit_of.measured
+    away = Parts(*(np.zeros(part.shape) for part in measured.parts))
+    # A misfit that alternates is as large as noise could be, but what was measured runs smoothly.
+    away.moments[:] = 40.0 * generator.standard_normal(away.moments.shape)
+    found, _ = settled(measured, away, Counts(), 2)
+    assert (found.moment_noise <= 1.25 * moment_roughness(measured.moments)).all()
+    assert (found.moment_noise > 1.2 * moment_roughness(measured.moments)).any()
