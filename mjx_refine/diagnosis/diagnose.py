@@ -116,7 +116,7 @@ def _diagnosed(
         compared = dataclasses.replace(compared, freed=freed)
     found = signs(clip, compared, outside.gain, outside.closed)
     leads = [c.lead for c in compared.candidates]
-    said = upheld(answer(found, leads, video=True), compared, found, lambda fit: outside_of(fit).closed)
+    said = upheld(answer(found, leads, video=True), compared, found, lambda fit: outside_of(fit).closed, video=True)
     told("report")
     return _result(clip, compared, outside_of, found, said, problem, observation, start.matching, seed, began)
 

@@ -15,7 +15,17 @@ from mjx_refine.diagnosis.fitted import prior
 from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.slack import impacts, slack_of, spins
-from mjx_refine.diagnosis.verdict import LIKELY, UNLIKELY, Answer, Signs, answer, signs, upheld
+from mjx_refine.diagnosis.verdict import (
+    LIKELY,
+    LIKELY_OF_A_VIDEO,
+    UNLIKELY,
+    Answer,
+    Signs,
+    answer,
+    counted,
+    signs,
+    upheld,
+)
 from mjx_refine.effects import batch_with_effects, catalogue
 from mjx_refine.effects.acting import apparent
 from mjx_refine.errors import InputError
@@ -240,6 +250,21 @@ def test_poses_may_err_smoothly_and_more_than_their_noise_says(changes):
 def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, likely):
     said = answer(dataclasses.replace(SIGNS, **changes), [300.0, 150.0], video=True)
     assert said.probability == (LIKELY if likely else UNLIKELY)
+
+
+def test_levels_counted_are_its_own_and_a_name_is_no_likelier_than_its_effect():
+    named, missed = (
+        answer(dataclasses.replace(SIGNS, **changes), [300.0, 150.0], video=True) for changes in ({}, {"closed": 0.05})
+    )
+    for said in (named, missed):
+        told = counted(said)
+        assert told.kind == said.kind
+        assert told.probability == LIKELY_OF_A_VIDEO > said.probability == LIKELY
+        assert counted(told) == told
+    assert counted(named).at_work >= LIKELY_OF_A_VIDEO
+    assert counted(missed).at_work < 1 - LIKELY_OF_A_VIDEO + 0.01
+    less = answer(dataclasses.replace(SIGNS, pair=30.0), [300.0, 150.0], video=True)
+    assert counted(less) == less
 
 
 @pytest.mark.parametrize(
