@@ -252,7 +252,7 @@ def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, li
     assert said.probability == (LIKELY if likely else UNLIKELY)
 
 
-def test_levels_counted_are_its_own_and_a_name_is_no_likelier_than_its_effect():
+def test_levels_of_a_video_are_its_own_and_a_name_is_no_likelier_than_its_effect():
     named, missed = (
         answer(dataclasses.replace(SIGNS, **changes), [300.0, 150.0], video=True) for changes in ({}, {"closed": 0.05})
     )
