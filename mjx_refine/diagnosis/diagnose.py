@@ -24,9 +24,10 @@ from mjx_refine.diagnosis.replay import Replay, replays
 from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Value, Verdict
 from mjx_refine.diagnosis.search import compare
 from mjx_refine.diagnosis.shown import view_of
+from mjx_refine.diagnosis.signs import MOSTLY, Signs, best_candidate, map_of, signs
 from mjx_refine.diagnosis.store import Store
 from mjx_refine.diagnosis.unnamed import freely_forced
-from mjx_refine.diagnosis.verdict import MOSTLY, NAMED, Answer, Signs, answer, best_candidate, map_of, signs, upheld
+from mjx_refine.diagnosis.verdict import NAMED, Answer, answer, upheld
 from mjx_refine.diagnosis.where import describe, misfit_map, places
 from mjx_refine.effects.kind import FitView
 from mjx_refine.errors import InputError

@@ -22,7 +22,7 @@ from mjx_refine.diagnosis.poses.fit import PosesFit, at_times, rate_of
 from mjx_refine.diagnosis.poses.heldout import kept_samples
 from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.diagnosis.poses.where import quiet
-from mjx_refine.diagnosis.verdict import Signs
+from mjx_refine.diagnosis.signs import Signs
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Body, Effect, Scene, load_scene, save_scene
 from mjx_refine.sim.c import MujocoSimulator

@@ -14,16 +14,15 @@ from mjx_refine.diagnosis.diagnose import verdict_of
 from mjx_refine.diagnosis.fitted import prior
 from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.signs import Signs, signs
 from mjx_refine.diagnosis.slack import impacts, slack_of, spins
 from mjx_refine.diagnosis.verdict import (
     LIKELY,
     LIKELY_OF_A_VIDEO,
     UNLIKELY,
     Answer,
-    Signs,
     answer,
     counted,
-    signs,
     upheld,
 )
 from mjx_refine.effects import batch_with_effects, catalogue

@@ -14,7 +14,8 @@ from mjx_refine.diagnosis.diagnose import prepared
 from mjx_refine.diagnosis.drawn_along import SHOWS, WHOLE, WITHIN, against, drawn_along, uncertain
 from mjx_refine.diagnosis.fit import ClipFit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.verdict import Signs, answer
+from mjx_refine.diagnosis.signs import Signs
+from mjx_refine.diagnosis.verdict import answer
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene

@@ -15,7 +15,8 @@ from mjx_refine.diagnosis.diagnose import prepared
 from mjx_refine.diagnosis.fit import ClipFit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.replay import replays
-from mjx_refine.diagnosis.verdict import STILL, Signs, answer
+from mjx_refine.diagnosis.signs import Signs
+from mjx_refine.diagnosis.verdict import STILL, answer
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.observation import Observation
 from mjx_refine.sim.c import MujocoSimulator

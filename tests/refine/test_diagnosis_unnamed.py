@@ -17,7 +17,8 @@ from mjx_refine.diagnosis import diagnose
 from mjx_refine.diagnosis.candidates import Freed
 from mjx_refine.diagnosis.diagnose import TO_THE_NOISE, verdict_of
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.verdict import MOSTLY, NAMED, UNNAMED, UNNAMED_ON_THE_FLOOR, Answer, answer, signs
+from mjx_refine.diagnosis.signs import MOSTLY, signs
+from mjx_refine.diagnosis.verdict import NAMED, UNNAMED, UNNAMED_ON_THE_FLOOR, Answer, answer
 from mjx_refine.effects import acting_kind, catalogue, kind_of
 from mjx_refine.effects.free_force import KNOTS
 from mjx_refine.errors import InputError

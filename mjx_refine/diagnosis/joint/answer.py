@@ -12,7 +12,8 @@ from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.heldout import Outside
 from mjx_refine.diagnosis.joint.search import JointCandidate, JointCompared
 from mjx_refine.diagnosis.result import Ranked, Value, Verdict
-from mjx_refine.diagnosis.verdict import AT_WORK, LIKELY, LITTLE, NAMED, Answer, Signs, answer, structure
+from mjx_refine.diagnosis.signs import Signs, structure
+from mjx_refine.diagnosis.verdict import AT_WORK, LIKELY, LITTLE, NAMED, Answer, answer
 
 JUDGED = 3
 """Single effects that are judged on held-out clips, the best evidence first."""
@@ -79,7 +80,7 @@ def said(
 
 
 def joint_signs(clips: Clips, compared: JointCompared, held_out: float, least: float) -> Signs:
-    """As ``verdict.signs``, over all fitted clips: structure is their mean."""
+    """As ``signs.signs``, over all fitted clips: structure is their mean."""
     singles, pairs, base = compared.candidates, compared.pairs, compared.base
     ends = [base, *(c.fit for c in (*singles[:3], *pairs[:1]))]
     unit = max(min(clips.misfit(fit) for fit in ends), least)

@@ -26,8 +26,8 @@ from mjx_refine.diagnosis.joint.together import (
 )
 from mjx_refine.diagnosis.result import Diagnosis
 from mjx_refine.diagnosis.shown import view_of
+from mjx_refine.diagnosis.signs import map_of
 from mjx_refine.diagnosis.store import Store
-from mjx_refine.diagnosis.verdict import map_of
 from mjx_refine.diagnosis.where import describe, misfit_map
 from mjx_refine.effects.kind import FitView
 from mjx_refine.errors import InputError

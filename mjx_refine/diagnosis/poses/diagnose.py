@@ -21,8 +21,9 @@ from mjx_refine.diagnosis.poses.where import describe, misfit_map, seen_frames
 from mjx_refine.diagnosis.result import Diagnosis, Gap, PoseErrors
 from mjx_refine.diagnosis.search import compare
 from mjx_refine.diagnosis.shown import view_of
+from mjx_refine.diagnosis.signs import Signs, best_candidate, signs
 from mjx_refine.diagnosis.store import Store
-from mjx_refine.diagnosis.verdict import Answer, Signs, answer, best_candidate, signs, upheld
+from mjx_refine.diagnosis.verdict import Answer, answer, upheld
 from mjx_refine.diagnosis.where import places_of
 from mjx_refine.effects import catalogue
 from mjx_refine.errors import InputError
