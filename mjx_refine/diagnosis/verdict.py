@@ -45,8 +45,8 @@ CLOSES = 0.1
 where it then leads by no more than is asked of what looks like noise, and leaves nothing that does not, nothing is missing."""
 
 WEAK, CLEAN = 0.25, 0.8
-"""The same of a single effect of one video, where contacts which err imitate it, and the structure of the residuals up to which it
-does not count: on seeds 10 to 20 of the withheld exams names that closed less and left no more than that were right on five
+"""The same of a single effect of one video, where contacts which err imitate it, and the structure of the residuals up to which
+it does not count: on seeds 10 to 20 of the withheld exams names that closed less and left no more than that were right on five
 clips and wrong on two, where ``unknown`` had been as wrong; those that left more were wrong on five of six."""
 
 STRANGE, CLEAR, STRANGEST = 1.3, 150.0, 3.2
