@@ -14,6 +14,7 @@ from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import beginning, chosen_of
+from mjx_refine.diagnosis.patches import patches_from_pushes
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.diagnosis.walls import push_last, walls_from_pushes
@@ -41,7 +42,7 @@ ROAMING = 2
 """How many of the best twos look beyond where least squares ended: they end a few tens of evidence apart by chance."""
 
 WALLS = 2
-"""How many of the best twos with a push are looked at with an obstacle in its place."""
+"""How many of the best twos with a push are looked at with an obstacle, or a patch of the floor, in its place."""
 
 Told = Callable[[str], None]
 Shown = Callable[[Fit], FitView]
@@ -79,9 +80,12 @@ def pairs_of(
     fits = _best_joined(clip, looks, [rival for _, _, rival in rows])
     found += [Candidate(fit, lead_of(fit, base), 0.0) for _, fit in fits]
     found = _gone_on(clip, base, found)
+    pushed = [one for one in found if "push" in one.names and one.lead > singles[0].lead][:WALLS]
     if "hidden_obstacle" in names:
-        found += _walled(clip, base, singles, found, shown, told)
-        found.sort(key=lambda one: -one.lead)
+        found += _walled(clip, base, singles, pushed, shown, told)
+    if "friction_patch" in names:
+        found += _patched(clip, base, pushed, shown, told)
+    found.sort(key=lambda one: -one.lead)
     best = [one for one in _differing(found)[:ROAMING] if one.lead > singles[0].lead]
     fits = clip.crew.each(clip, _roamed, [(one.fit, seed) for one in best])
     found = [one for one in found if not any(one is other for other in best)]
@@ -157,12 +161,11 @@ def _walled(
     clip: ClipFit,
     base: Fit,
     singles: tuple[Candidate, ...],
-    found: list[Candidate],
+    pushed: list[Candidate],
     shown: Shown,
     told: Told,
 ) -> list[Candidate]:
-    """The best twos with a push once more with an obstacle in its place."""
-    pushed = [one for one in found if "push" in one.names and one.lead > singles[0].lead][:WALLS]
+    """Twos with a push once more with an obstacle in its place."""
     lines = [f"{_other(one, 'push')} and hidden_obstacle" for one in pushed]
     rows = [(push_last(one.fit), shown(one.fit), _without_push(base, singles, one)) for one in pushed]
     walls = walls_from_pushes(clip, rows, told, lines)
@@ -170,6 +173,19 @@ def _walled(
         Candidate(wall, lead_of(wall, base), one.promise)
         for wall, one in zip(walls, pushed, strict=True)
         if wall is not None
+    ]
+
+
+def _patched(clip: ClipFit, base: Fit, pushed: list[Candidate], shown: Shown, told: Told) -> list[Candidate]:
+    """Twos with a push once more with a patch of the floor in its place."""
+    pushed = [one for one in pushed if "friction_patch" not in one.names]
+    for one in pushed:
+        told(f"{_other(one, 'push')} and friction_patch")
+    patches = patches_from_pushes(clip, [(push_last(one.fit), shown(one.fit)) for one in pushed])
+    return [
+        Candidate(patch, lead_of(patch, base), one.promise)
+        for patch, one in zip(patches, pushed, strict=True)
+        if patch is not None
     ]
 
 

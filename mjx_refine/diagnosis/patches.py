@@ -20,8 +20,8 @@ how long."""
 
 
 def patches_from_pushes(clip: ClipFit, pushes: Sequence[tuple[Fit, FitView]]) -> list[Fit | None]:
-    """For each fit, whose only effect is a push, the best with a patch that is crossed about then; None where its object is not
-    on the floor."""
+    """For each fit, whose last effect is a push, the best with a patch in its place that is crossed about then; None where its
+    object is not on the floor."""
     begun = clip.crew.each(clip, _crossings, list(pushes))
     fits = iter(clip.crew.each(clip, _fitted, [(*row, LOOK) for rows in begun for row in rows]))
     best = [max((next(fits) for _ in rows), key=lambda fit: fit.evidence, default=None) for rows in begun]
@@ -31,8 +31,9 @@ def patches_from_pushes(clip: ClipFit, pushes: Sequence[tuple[Fit, FitView]]) ->
 
 
 def _crossings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis, np.ndarray]]:
-    (push,) = fit.hypothesis.terms
-    time = float(fit.hypothesis.values(fit.z[None], 0)[0, 0])
+    *others, push = fit.hypothesis.terms
+    rest = dataclasses.replace(fit.hypothesis, terms=tuple(others))
+    time = float(fit.hypothesis.values(fit.z[None], len(others))[0, 0])
     poses = clip.poses(fit.hypothesis, fit.z[None])[0]
     if not np.isfinite(poses).all():
         return []
@@ -40,18 +41,19 @@ def _crossings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis,
     starts = FrictionPatch().crossed(dataclasses.replace(view, poses=poses), push.target, frame)
     if not starts:
         return []
-    plain, own = fit.ordinary
     terms = [term_of("friction_patch", -1, start, clip.frames) for start in starts]
     nothing = np.zeros(len(terms[0].centre))
     found = []
     # A push that ended badly has bent the ordinary numbers, and the given scene's are bent by nothing.
-    for ground in (own[0], np.zeros(plain.dimension)):
+    plain = rest.space.dimension
+    beside = fit.z[plain : rest.dimension]
+    for ground in (fit.z[: rest.dimension], np.concatenate([np.zeros(plain), beside])):
         at = [np.concatenate([ground, (one.centre - terms[0].centre) / terms[0].width]) for one in terms]
-        white, costs = clip.residuals(plain.added(terms[0]), np.array(at))
+        white, costs = clip.residuals(rest.added(terms[0]), np.array(at))
         # Without the prior, which is the first one's.
         left = np.where(np.isfinite(costs), (white**2).sum(1), np.inf)
         best = np.argsort(left, kind="stable")[:BEGUN]
-        found += [(plain.added(terms[k]), np.concatenate([ground, nothing])) for k in best]
+        found += [(rest.added(terms[k]), np.concatenate([ground, nothing])) for k in best]
     return found
 
 

@@ -16,6 +16,7 @@ from mjx_refine.diagnosis.candidates import AGAINST, AT_IMPACT, DOUBT, LEAST_UNI
 from mjx_refine.diagnosis.fitted import Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.walls import push_last
+from mjx_refine.effects.push import Push
 from mjx_refine.sim.c import MujocoSimulator
 
 MISFIT = 0.8
@@ -126,3 +127,9 @@ def test_a_push_becomes_the_last_effect_and_takes_its_numbers_along():
     np.testing.assert_array_equal(turned.z[: space.dimension], z[: space.dimension])
     again = push_last(turned)
     np.testing.assert_array_equal(again.z, turned.z)
+
+
+@pytest.mark.parametrize(("time", "frames"), [(0.72, (21, 23)), (0.71, (20, 22)), (0.0, (0, 1)), (0.97, (28, 29))])
+def test_a_push_shows_in_the_frame_that_is_nearest_and_in_its_neighbours(time, frames):
+    view = SimpleNamespace(fps=30.0, frames=30)
+    assert Push().window(view, 0, np.array([time, 1.0, 0.0, 0.0])) == frames
