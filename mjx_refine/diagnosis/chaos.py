@@ -41,18 +41,19 @@ def jaggedness(told: Prediction) -> Parts:
     return Parts(bend(told.reach), bend(told.flow), moments, None)
 
 
-def believed(jagged: Parts, residual: Parts) -> Parts:
+def believed(jagged: Parts, residual: Parts, excused: float = EXCUSED) -> Parts:
     """How much of the jaggedness is excused: where the fit followed all the same, no more than it leaves.
 
     Args:
       jagged: of ``jaggedness`` [px].
       residual: what the fit leaves of each number [px].
+      excused: multiple of that up to which it is believed.
     """
 
     def least(part: np.ndarray, square: np.ndarray) -> np.ndarray:
         # Running sums may end a little below zero.
         near = np.maximum(uniform_filter1d(square, NEARBY, axis=0), 0.0)
-        return np.minimum(part, EXCUSED * np.sqrt(near))
+        return np.minimum(part, excused * np.sqrt(near))
 
     return Parts(
         least(jagged.reach, (residual.reach**2).mean(-1)),

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.diagnosis.apart import beside
-from mjx_refine.diagnosis.chaos import believed, drawn, jaggedness
+from mjx_refine.diagnosis.chaos import EXCUSED, believed, drawn, jaggedness
 from mjx_refine.diagnosis.crew import Crew
 from mjx_refine.diagnosis.drawn_along import always_off
 from mjx_refine.diagnosis.fitted import Fit, prior
@@ -182,7 +182,7 @@ class ClipFit:
         self.__dict__.pop("facts", None)
         return self.measured.count < before.count
 
-    def allow_chaos(self, fit: Fit, seed: int) -> None:
+    def allow_chaos(self, fit: Fit, seed: int, excused: float = EXCUSED) -> None:
         """Adds the rollout's own jaggedness around a fit to the noise, as far as the fit leaves something of it.
 
         After contacts the paths of bodies jump with the smallest change of a parameter. Of three rollouts on a line, two
@@ -193,7 +193,7 @@ class ClipFit:
         white = self.measured.split(self.residuals(fit.hypothesis, fit.z[None])[0][0])
         counts = self.counts.of(self.measured.parts)
         left = Parts(*(w * sigma / np.sqrt(c) for w, sigma, c in zip(white, self.widths, counts, strict=True)))
-        self.noise = jagged(self.measured, believed(jaggedness(told), left), self.noise.background)
+        self.noise = jagged(self.measured, believed(jaggedness(told), left, excused), self.noise.background)
 
     def _slack(self, keep: np.ndarray | None, told: Hypothesis | None) -> Slack | None:
         if self._columns is None:

@@ -39,6 +39,10 @@ PATIENCE = 6.0
 LATE = 0.2 / VIDEO
 """How uncertain the moment of an impact is [s]: laboratories' floors are no engine's."""
 
+EXCUSED = 2.0
+"""As ``chaos.EXCUSED``, which was measured on videos: trackers err smoothly, and heights read off a video more than they are
+rough."""
+
 UNSEEN_TURN = 3.0
 """Standard deviation of a turn that a picture would not show (of a sphere, of a cylinder about its axis), and that no
 parameter holds, in noise widths of one measured rotation: the first measured pose is the start's."""
@@ -171,6 +175,10 @@ class PosesFit(ClipFit):
 
     def settle_noise(self, fit: Fit, order: int = 2) -> None:
         """Does nothing: the noise is stated, or comes from third differences, which owe nothing to a fit."""
+
+    def allow_chaos(self, fit: Fit, seed: int, excused: float = EXCUSED) -> None:
+        """As ``ClipFit.allow_chaos``."""
+        super().allow_chaos(fit, seed, excused)
 
     def _loosened(self, batch: SceneBatch, poses: np.ndarray, found: list[Impact], still: Prediction, kicks) -> Loose:
         blur = functools.partial(self._blurred, self.noise, batch, found)
