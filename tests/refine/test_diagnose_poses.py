@@ -13,9 +13,12 @@ from own_poses import BALL, CAMERA, GIVEN, SIGMA, THROW, acting, exact, recorded
 
 from mjx_refine import rotations
 from mjx_refine.cli.main import run
-from mjx_refine.diagnosis import diagnose_poses, load_poses, make_poses
+from mjx_refine.diagnosis import chaos, diagnose_poses, load_poses, make_poses
+from mjx_refine.diagnosis import fit as fitting
 from mjx_refine.diagnosis.candidates import Candidate, Compared
+from mjx_refine.diagnosis.fit import ClipFit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.measure import Parts
 from mjx_refine.diagnosis.poses.data import noise_of, rotation_vector
 from mjx_refine.diagnosis.poses.diagnose import unsettled
 from mjx_refine.diagnosis.poses.fit import PosesFit, at_times, rate_of
@@ -232,6 +235,24 @@ def test_what_impacts_excuse_is_told_all_the_same():
     far = dataclasses.replace(scene, objects=(dataclasses.replace(scene.objects[0], position=(-0.9, 0.4, 1.0)),))
     fit = clip.at(Hypothesis(poses_space(far)), np.zeros(poses_space(far).dimension))
     assert "what impacts may err, which here is much: ball is off by 1" in quiet(clip, fit)
+
+
+def test_of_poses_more_is_excused_than_of_videos(monkeypatch):
+    poses = recorded(THROW, span=0.4)
+    scene = started(GIVEN, poses, (0,))
+
+    def widened(allow) -> np.ndarray:
+        clip = PosesFit(MujocoSimulator(scene.shapes, rate_of(poses.time), 1), poses, (0,))
+        fit = clip.at(Hypothesis(poses_space(scene)), np.full(poses_space(scene).dimension, 0.3))
+        allow(clip, fit)
+        return np.sqrt(clip.noise.moments**2 - clip.measured.moment_noise**2)
+
+    everything = Parts(np.full((1, 1), 1e9), np.full((1, 1), 1e9), np.full((1, 1, 3), 1e9), None)
+    monkeypatch.setattr(fitting, "jaggedness", lambda told: everything)
+    of_poses = widened(lambda clip, fit: clip.allow_chaos(fit, 0))
+    of_videos = widened(lambda clip, fit: ClipFit.allow_chaos(clip, fit, 0))
+    assert of_videos.max() > 0.0
+    assert of_poses == pytest.approx(2.0 / chaos.EXCUSED * of_videos)
 
 
 def test_the_start_is_taken_from_the_first_samples():

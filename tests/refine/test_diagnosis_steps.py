@@ -169,6 +169,7 @@ def test_chaos_is_believed_as_far_as_the_fit_leaves_something():
     assert np.allclose(found.reach, EXCUSED * 0.5)
     assert np.allclose(found.flow, 5.0)
     assert np.allclose(found.moments, 0.01)
+    assert np.allclose(believed(jagged, left, 2.0).reach, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
