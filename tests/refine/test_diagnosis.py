@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from own_clip import CAMERA, SIZE
 
-from mjx_refine.diagnosis import diagnose, verdict
+from mjx_refine.diagnosis import diagnose
+from mjx_refine.diagnosis import signs as reading
 from mjx_refine.diagnosis.diagnose import verdict_of
 from mjx_refine.diagnosis.fitted import prior
 from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
@@ -51,8 +52,8 @@ def clip_of(scene: Scene, frames: int = 20, seed: int = 0) -> Observation:
 
 def without_residuals(monkeypatch: pytest.MonkeyPatch) -> None:
     """Signs that are read off residuals are as noise has them."""
-    monkeypatch.setattr(verdict, "structure", lambda clip, fit: 1.0)
-    monkeypatch.setattr(verdict, "unsteadiness", lambda clip, fit: 0.0)
+    monkeypatch.setattr(reading, "structure", lambda clip, fit: 1.0)
+    monkeypatch.setattr(reading, "unsteadiness", lambda clip, fit: 0.0)
 
 
 def test_slack_whitens_the_covariance_of_its_columns():
