@@ -112,7 +112,8 @@ likely, or one of two, 26 of 45), and where it is not (3 of 30, 2 of 54, 7 of 35
 LIKELY_OF_A_VIDEO, AT_WORK_OF_A_VIDEO = 0.83, {AT_WORK["likely"]: 0.92, AT_WORK["unknown"]: 0.17}
 """The first level of one video, and how often the effect that leads most was at work there, in place of the above where something
 is named and of ``unknown``. Counted on seeds 20 and 21 of the withheld exams, the first two since contacts excuse less: 54 of 62
-right, where 0.72 had been said, and 54 of 68, where 0.86 had; 55 of 59 single effects named; 7 of 34 where ``unknown`` was said."""
+right, where 0.72 had been said, and 54 of 68, where 0.86 had; 55 of 59 single effects named; 7 of 34 where ``unknown`` was
+said."""
 
 MORE, UNSEEN = 6.0, 2.5
 """What speaks against an answer: a lead of the best two effects over the best one of more than this times the root of one and the
