@@ -80,11 +80,7 @@ def pairs_of(
     fits = _best_joined(clip, looks, [rival for _, _, rival in rows])
     found += [Candidate(fit, lead_of(fit, base), 0.0) for _, fit in fits]
     found = _gone_on(clip, base, found)
-    pushed = [one for one in found if "push" in one.names and one.lead > singles[0].lead][:WALLS]
-    if "hidden_obstacle" in names:
-        found += _walled(clip, base, singles, pushed, shown, told)
-    if "friction_patch" in names:
-        found += _patched(clip, base, pushed, shown, told)
+    found += list(_in_place_of_pushes(clip, base, singles, found, names, shown, told))
     found.sort(key=lambda one: -one.lead)
     best = [one for one in _differing(found)[:ROAMING] if one.lead > singles[0].lead]
     fits = clip.crew.each(clip, _roamed, [(one.fit, seed) for one in best])
@@ -157,36 +153,29 @@ def _together(
             yield hypothesis, clip.best_of(hypothesis, points), one, other
 
 
-def _walled(
+def _in_place_of_pushes(
     clip: ClipFit,
     base: Fit,
     singles: tuple[Candidate, ...],
-    pushed: list[Candidate],
+    found: list[Candidate],
+    names: list[str],
     shown: Shown,
     told: Told,
-) -> list[Candidate]:
-    """Twos with a push once more with an obstacle in its place."""
-    lines = [f"{_other(one, 'push')} and hidden_obstacle" for one in pushed]
-    rows = [(push_last(one.fit), shown(one.fit), _without_push(base, singles, one)) for one in pushed]
-    walls = walls_from_pushes(clip, rows, told, lines)
-    return [
-        Candidate(wall, lead_of(wall, base), one.promise)
-        for wall, one in zip(walls, pushed, strict=True)
-        if wall is not None
-    ]
-
-
-def _patched(clip: ClipFit, base: Fit, pushed: list[Candidate], shown: Shown, told: Told) -> list[Candidate]:
-    """Twos with a push once more with a patch of the floor in its place."""
-    pushed = [one for one in pushed if "friction_patch" not in one.names]
-    for one in pushed:
-        told(f"{_other(one, 'push')} and friction_patch")
-    patches = patches_from_pushes(clip, [(push_last(one.fit), shown(one.fit)) for one in pushed])
-    return [
-        Candidate(patch, lead_of(patch, base), one.promise)
-        for patch, one in zip(patches, pushed, strict=True)
-        if patch is not None
-    ]
+) -> Iterator[Candidate]:
+    """The best twos with a push once more with an obstacle, and with a patch of the floor, in its place."""
+    pushed = [one for one in found if "push" in one.names and one.lead > singles[0].lead][:WALLS]
+    ends = [(push_last(one.fit), shown(one.fit)) for one in pushed]
+    others = [_other(one, "push") for one in pushed]
+    fits: list[Fit | None] = []
+    if "hidden_obstacle" in names:
+        rows = [(*end, _without_push(base, singles, one)) for end, one in zip(ends, pushed, strict=True)]
+        fits += walls_from_pushes(clip, rows, told, [f"{other} and hidden_obstacle" for other in others])
+    if "friction_patch" in names:
+        floors = [(end, other) for end, other in zip(ends, others, strict=True) if other != "friction_patch"]
+        for _, other in floors:
+            told(f"{other} and friction_patch")
+        fits += patches_from_pushes(clip, [end for end, _ in floors])
+    yield from (Candidate(fit, lead_of(fit, base), 0.0) for fit in fits if fit is not None)
 
 
 def _without_push(base: Fit, singles: tuple[Candidate, ...], one: Candidate) -> float:

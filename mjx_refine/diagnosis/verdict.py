@@ -60,8 +60,8 @@ such verdicts on seeds 12 to 16 of the withheld exams the 14 right ones left 0.4
 3.8."""
 
 TURNS = 0.5
-"""Part of its lead by which a force of any course must be worse than such an effect for it not to be one that bends: then it
-turns objects as no force does."""
+"""Part of its lead by which a force of any course must be worse than such an effect for it not to be one that bends. On seeds
+10 to 20 of the withheld exams one more name passes by it, which is right."""
 
 FAR_OFF = 2.0
 """Mean square residual of the best hypothesis above which that is not what, or not all that, is missing."""

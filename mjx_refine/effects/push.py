@@ -50,6 +50,6 @@ class Push(EffectKind):
         return [Start(np.array([t, 0.0, 0.0, 0.0]), columns, width, places=len(onsets)) for t in onsets]
 
     def window(self, view: FitView, target: int, values: np.ndarray) -> tuple[int, int] | None:
-        # The path bends between two frames; what shows that, flow above all, is of these and their neighbour.
+        # The frame that is nearest to where the path bends, and its neighbours.
         nearest = int(np.clip(np.round(values[0] * view.fps), 0, view.frames - 1))
         return max(nearest - 1, 0), min(nearest + 1, view.frames - 1)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_diagnosis import FLIGHT
 
-from mjx_refine.diagnosis import candidates
+from mjx_refine.diagnosis import candidates, pairs
 from mjx_refine.diagnosis.base import base_space
 from mjx_refine.diagnosis.candidates import AGAINST, AT_IMPACT, DOUBT, LEAST_UNIT, Candidate, in_order, lead_of
 from mjx_refine.diagnosis.fitted import Fit
@@ -133,3 +133,32 @@ def test_a_push_becomes_the_last_effect_and_takes_its_numbers_along():
 def test_a_push_shows_in_the_frame_that_is_nearest_and_in_its_neighbours(time, frames):
     view = SimpleNamespace(fps=30.0, frames=30)
     assert Push().window(view, 0, np.array([time, 1.0, 0.0, 0.0])) == frames
+
+
+@pytest.mark.parametrize("without", ["", "hidden_obstacle", "friction_patch"])
+def test_twos_with_a_push_are_tried_with_an_obstacle_and_with_a_patch_in_its_place(monkeypatch, without):
+    def fitted(evidence: float) -> SimpleNamespace:
+        return SimpleNamespace(evidence=evidence, cost=-evidence, hypothesis=SimpleNamespace(terms=()))
+
+    def two(other: str, lead: float) -> SimpleNamespace:
+        return SimpleNamespace(names=(other, "push"), targets=(-1, 0), lead=lead, fit=fitted(lead))
+
+    asked: dict[str, list[float]] = {}
+
+    def tried(name: str, clip, pushes, *rest) -> list[SimpleNamespace | None]:
+        asked[name] = [row[0].evidence for row in pushes]
+        return [None if row[0].evidence > 250.0 else fitted(row[0].evidence + 1.0) for row in pushes]
+
+    monkeypatch.setattr(pairs, "push_last", lambda fit: fit)
+    monkeypatch.setattr(pairs, "walls_from_pushes", lambda *row: tried("hidden_obstacle", *row))
+    monkeypatch.setattr(pairs, "patches_from_pushes", lambda *row: tried("friction_patch", *row))
+    shake = SimpleNamespace(names=("camera_shake",), targets=(-1,), lead=150.0, fit=fitted(150.0))
+    twos = [two("camera_shake", 300.0), two("friction_patch", 200.0), two("slope", 140.0)]
+    names = [name for name in ("push", "hidden_obstacle", "friction_patch") if name != without]
+    found = list(
+        pairs._in_place_of_pushes(None, fitted(0.0), (shake,), twos, names, lambda fit: None, lambda line: None)
+    )
+    # One that no single effect leads, and no second patch beside a patch.
+    everything = {"hidden_obstacle": [300.0, 200.0], "friction_patch": [300.0]}
+    assert asked == {name: rows for name, rows in everything.items() if name != without}
+    assert [one.lead for one in found] == ([] if without == "hidden_obstacle" else [201.0])
