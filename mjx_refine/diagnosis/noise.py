@@ -47,6 +47,10 @@ class Noise:
     moments: Float[np.ndarray, "frames objects 3"]
     background: float
 
+    def times(self, factor: float) -> Noise:
+        """So many times as much."""
+        return Noise(factor * self.edge, factor * self.flow, factor * self.moments, factor * self.background)
+
 
 @dataclasses.dataclass(frozen=True)
 class Counts:

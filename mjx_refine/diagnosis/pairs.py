@@ -17,6 +17,7 @@ from mjx_refine.diagnosis.leads import beginning, chosen_of
 from mjx_refine.diagnosis.patches import patches_from_pushes
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
+from mjx_refine.diagnosis.tempered import beside_tempered, cooled
 from mjx_refine.diagnosis.walls import push_last, walls_from_pushes
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
@@ -31,6 +32,9 @@ effects are looked at beside each."""
 JOINED, LOOK, TOGETHER = 4, 4, 6
 """Of how many of the best effects twos are put together, after how many steps their fits are compared, how many of these go on:
 what each found alone is a better place to begin than a linear look from a fit that has bent to the other effect."""
+
+COOLED = 5
+"""How many twos that were fitted with more noise go on with the noise as it is."""
 
 PARTS = ((1.0, 1.0), (0.5, 0.5), (1.0, 0.3), (0.3, 1.0), (0.7, 0.7))
 """How much of each of two effects their common fit begins with: alone, each explains part of what is the other's."""
@@ -73,6 +77,7 @@ def pairs_of(
     looks = clip.crew.each(clip, _second, [(first.fit, lead) for first, lead in beside], told, lines)
     fits = _best_joined(clip, looks, [first.fit.cost for first, _ in beside])
     found = [Candidate(fit, lead_of(fit, base), beside[k][1].gain) for k, fit in fits]
+    found += _annealed(clip, base, singles, names, shown, told)
     together = list(_together(clip, base, singles)) if beside else []
     lines = [f"{first.names[0]} and {second.names[0]}, together" for _, _, first, second in together]
     rows = [(hypothesis, z, min(first.fit.cost, second.fit.cost)) for hypothesis, z, first, second in together]
@@ -119,16 +124,41 @@ def _beside(
     clip: ClipFit, singles: tuple[Candidate, ...], names: list[str], shown: Shown
 ) -> Iterator[tuple[Candidate, Lead]]:
     """Forward selection: what the linear look promises beside the best effects."""
-    firsts: list[Candidate] = []
-    for one in itertools.takewhile(lambda one: one.lead >= PROMISE_OF_PAIRS, singles):
-        if len(firsts) < FIRSTS and not any(_one_cause(one, other) for other in firsts):
-            firsts.append(one)
-    for first in firsts:
-        others = [n for n in names if n not in first.names or catalogue()[n].targeted]
+    for first in _firsts(singles):
+        others = _others(first.fit, names)
         leads = Screen(clip, first.fit, shown(first.fit)).leads(others)
         leads = [x for x in leads if (x.name, x.target) not in set(zip(first.names, first.targets, strict=True))]
         # So many effects, not so many moments of one push.
         yield from ((first, x) for x in chosen_of(leads, SECONDS, 1) if x.gain > SECOND_PROMISE)
+
+
+def _firsts(singles: tuple[Candidate, ...]) -> list[Candidate]:
+    """Beside which second effects are looked for."""
+    firsts: list[Candidate] = []
+    for one in itertools.takewhile(lambda one: one.lead >= PROMISE_OF_PAIRS, singles):
+        if len(firsts) < FIRSTS and not any(_one_cause(one, other) for other in firsts):
+            firsts.append(one)
+    return firsts
+
+
+def _others(first: Fit, names: list[str]) -> list[str]:
+    """Effects that are looked for beside one."""
+    return [n for n in names if catalogue()[n].targeted or n not in {t.name for t in first.hypothesis.terms}]
+
+
+def _annealed(
+    clip: ClipFit, base: Fit, singles: tuple[Candidate, ...], names: list[str], shown: Shown, told: Told
+) -> list[Candidate]:
+    """Second effects beside the best ones with more noise than there is: there the first has not bent towards the second."""
+    firsts = _firsts(singles)
+    found = beside_tempered(clip, [one.fit for one in firsts], lambda fit: _others(fit, names), shown, told, SECONDS)
+    rival = min((one.fit.cost for one in firsts), default=np.inf)
+    fits = clip.crew.each(clip, _cooled, [(fit, rival) for _, fit in found[:COOLED]])
+    return [Candidate(fit, lead_of(fit, base), lead.gain) for (lead, _), fit in zip(found, fits, strict=False)]
+
+
+def _cooled(clip: ClipFit, fit: Fit, rival: float) -> Fit:
+    return _joined(clip, cooled(clip, fit), fit.z, rival)
 
 
 def _one_cause(one: Candidate, other: Candidate) -> bool:

@@ -20,6 +20,7 @@ from mjx_refine.diagnosis.patches import patches_from_pushes
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.diagnosis.shown import view_of
+from mjx_refine.diagnosis.tempered import annealed
 from mjx_refine.diagnosis.walls import walls_from_pushes
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
@@ -106,7 +107,7 @@ def compare(
     impacts = clip.allow_slack(base)
     base = _of_own_contacts(clip, clip.fit(base.hypothesis, base.z, 10))
     names = [name for name in catalogue() if name not in without]
-    base, singles = _singles(clip, base, names, scene, observation, masks_of, seed, told)
+    base, singles = _singles(clip, base, names, scene, observation, masks_of, seed, told, begin is None)
     if (thin := thinness(singles)) > THIN and clip.leave_out(_may_be_cut(clip, observation, masks_of, thin)):
         told("thin masks, without what other objects may hide of them")
         base, singles, impacts = _again(clip, base, singles, seed)
@@ -118,13 +119,11 @@ def compare(
 
 
 def _singles(
-    clip: ClipFit, base: Fit, names, scene, observation, masks_of, seed: int, told: Told
+    clip: ClipFit, base: Fit, names, scene, observation, masks_of, seed: int, told: Told, video: bool
 ) -> tuple[Fit, tuple[Candidate, ...]]:
     fitted: Fitted = {}
     walled: list[Fit] = []
     tried: Fit | None = None
-    zero = clip.at(base.hypothesis, np.zeros(base.hypothesis.dimension), scale=FORGIVING)
-    zero = clip.at(dataclasses.replace(zero.hypothesis, slack=clip.slack_along(zero)), zero.z, scale=FORGIVING)
     for again in range(2):
         told("looking ahead")
         view = view_of(clip, base, observation, masks_of)
@@ -133,11 +132,13 @@ def _singles(
         rows = [(base, lead, SCALE) for lead in chosen]
         if again == 0:
             # The base model's fit has bent its parameters towards the effect; from the given scene the way is straight.
-            looked = Screen(clip, zero, view_of(clip, zero, observation, masks_of), FORGIVING)
-            given = looked.leads(names)
-            rows += [(zero, lead, FORGIVING) for lead in chosen_of(given, FRESH, 1)]
             rows += [(base, lead, SCALE) for lead in ahead.away(names)]
-            rows += [(zero, lead, FORGIVING) for lead in chosen_of(looked.away(names), FRESH)]
+            if video:
+                _keep_annealed(
+                    clip, base, fitted, names, lambda fit: view_of(clip, fit, observation, masks_of), told, scene
+                )
+            else:
+                rows += _from_given(clip, base, names, observation, masks_of)
         _keep_leads(clip, base, fitted, rows, told, scene)
         _in_place_of_pushes(clip, base, fitted, walled, view, names, told)
         best = max((fit for fit, _ in fitted.values()), key=lambda fit: fit.evidence, default=base)
@@ -165,6 +166,28 @@ def _singles(
     fitted = at_least_nothing(clip, base, fitted)
     finals = [Candidate(fit, lead_of(fit, base), promise) for fit, promise in fitted.values()]
     return base, in_order(clip, finals)
+
+
+def _from_given(clip: ClipFit, base: Fit, names, observation, masks_of) -> list[Row]:
+    """Leads from the given scene."""
+    zero = clip.at(base.hypothesis, np.zeros(base.hypothesis.dimension), scale=FORGIVING)
+    zero = clip.at(dataclasses.replace(zero.hypothesis, slack=clip.slack_along(zero)), zero.z, scale=FORGIVING)
+    looked = Screen(clip, zero, view_of(clip, zero, observation, masks_of), FORGIVING)
+    leads = [*chosen_of(looked.leads(names), FRESH, 1), *chosen_of(looked.away(names), FRESH)]
+    return [(zero, lead, FORGIVING) for lead in leads]
+
+
+def _keep_annealed(
+    clip: ClipFit, base: Fit, fitted: Fitted, names, shown: Callable[[Fit], FitView], told: Told, scene: Scene
+) -> None:
+    """The same of a video, whose scene a refinement may have bent: there noise begins larger than it is."""
+    told("looking ahead from the given scene")
+
+    def line(lead: Lead) -> str:
+        return f"{lead.name} {target_name(scene.names, lead.target)}".strip()
+
+    for lead, fit in annealed(clip, base, names, shown, told, line):
+        _keep(fitted, (lead.name, lead.target), fit, lead.gain)
 
 
 def _from_the_best(

@@ -1,0 +1,127 @@
+"""Fits that begin where noise is thought to be larger, and end where it is what it is (deterministic annealing, Rose 1998).
+
+With the noise as it is, the base model's ordinary numbers bend by ten prior widths and more to imitate an effect, since each
+noise width that they gain is worth it, and least squares that begin there, or at a given scene that is far off, seldom find the
+way back. With ten times the noise they are held near the given scene, residuals hold the effect itself, and a linear look tells
+which it is. From there on the noise falls, and every fit follows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.knock import knocked
+from mjx_refine.diagnosis.leads import beginning, chosen_of
+from mjx_refine.diagnosis.screen import Lead, Screen
+from mjx_refine.effects.kind import FitView
+
+WARM, COOLER = 10.0, 3.0
+"""Multiples of the noise with which fits begin, and with which they go on."""
+
+GROUND, FIRST, FURTHER, LAST = 10, 8, 6, 9
+"""Iterations of the base model, of effects beside it, of both with less noise, and with the noise as it is."""
+
+FAMILIES, GO_ON, END = 10, 6, 4
+"""Effects and targets that are fitted with the most noise, those that go on with less, and those that go on to the end."""
+
+Shown = Callable[[Fit], FitView]
+Told = Callable[[str], None]
+
+
+@contextlib.contextmanager
+def tempered(clip: ClipFit, factor: float) -> Iterator[None]:
+    """So many times the noise, and nothing else that may err, for a while."""
+    kept = clip.settled
+    clip.settled = dataclasses.replace(kept, noise=kept.noise.times(factor), columns=None)
+    try:
+        yield
+    finally:
+        clip.settled = kept
+
+
+def annealed(
+    clip: ClipFit, base: Fit, names: list[str], shown: Shown, told: Told, lines: Callable[[Lead], str]
+) -> list[tuple[Lead, Fit]]:
+    """The most promising effects, each with where its fit ends once the noise has fallen to what it is.
+
+    Args:
+      clip: residuals.
+      base: the base model's fit; what costs far more in the end is given up.
+      names: of the catalogue.
+      shown: what a fit shows to those who look for a start.
+      told: called with a line for each step.
+      lines: the line of a lead.
+    """
+    plain = dataclasses.replace(base.hypothesis, slack=None)
+    with tempered(clip, WARM):
+        ground = clip.fit(plain, np.zeros(plain.dimension), GROUND)
+        leads = chosen_of(Screen(clip, ground, shown(ground)).leads(names), FAMILIES, 1)
+        rows = [(ground, lead) for lead in leads]
+        fits = clip.crew.each(clip, _first, rows, told, [lines(lead) for lead in leads])
+    found = _cheapest(list(zip(leads, fits, strict=True)), GO_ON)
+    with tempered(clip, COOLER):
+        fits = clip.crew.each(clip, _further, [(fit,) for _, fit in found])
+    found = _cheapest([(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)], END)
+    fits = clip.crew.each(clip, _last, [(fit, base.cost) for _, fit in found])
+    return [(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)]
+
+
+def beside_tempered(
+    clip: ClipFit, firsts: list[Fit], names_beside: Callable[[Fit], list[str]], shown: Shown, told: Told, seconds: int
+) -> list[tuple[Lead, Fit]]:
+    """Fits of a second effect beside each of some first ones, with more noise than there is; the cheapest first.
+
+    Args:
+      clip: residuals.
+      firsts: fits with one effect.
+      names_beside: of the effects that are looked for beside one.
+      shown: what a fit shows to those who look for a start.
+      told: called with a line for each step.
+      seconds: how many second effects are fitted beside each.
+    """
+    with tempered(clip, COOLER):
+        grounds = clip.crew.each(clip, _further, [(_plain(fit),) for fit in firsts])
+        rows: list[tuple[Fit, Lead]] = []
+        for ground in grounds:
+            one = ground.hypothesis.terms[0]
+            leads = Screen(clip, ground, shown(ground)).leads(names_beside(ground))
+            leads = [lead for lead in leads if (lead.name, lead.target) != (one.name, one.target)]
+            rows += [(ground, lead) for lead in chosen_of(leads, seconds, 1)]
+        lines = [f"{ground.hypothesis.terms[0].name} and {lead.name}" for ground, lead in rows]
+        fits = clip.crew.each(clip, _first, rows, told, lines)
+    return _cheapest([(lead, fit) for (_, lead), fit in zip(rows, fits, strict=True)], len(fits))
+
+
+def cooled(clip: ClipFit, fit: Fit) -> Hypothesis:
+    """The hypothesis of a tempered fit with what contacts along its path may err by."""
+    return dataclasses.replace(fit.hypothesis, slack=clip.slack_along(fit))
+
+
+def _cheapest(found: list[tuple[Lead, Fit]], count: int) -> list[tuple[Lead, Fit]]:
+    return sorted(found, key=lambda one: one[1].cost)[:count]
+
+
+def _plain(fit: Fit) -> Fit:
+    """The fit without what its contacts may err by."""
+    terms = tuple(dataclasses.replace(t, excused=None) for t in fit.hypothesis.terms)
+    return dataclasses.replace(fit, hypothesis=dataclasses.replace(fit.hypothesis, slack=None, terms=terms))
+
+
+def _first(clip: ClipFit, ground: Fit, lead: Lead) -> Fit:
+    one = lead.term(clip.frames)
+    hypothesis = ground.hypothesis.added(one)
+    return clip.fit(hypothesis, beginning(clip, hypothesis, ground, lead, lead.z(one)), FIRST, rival=ground.cost)
+
+
+def _further(clip: ClipFit, fit: Fit) -> Fit:
+    return clip.fit(fit.hypothesis, fit.z, FURTHER)
+
+
+def _last(clip: ClipFit, fit: Fit, rival: float) -> Fit:
+    return knocked(clip, clip.fit(cooled(clip, fit), fit.z, LAST, rival=rival), rival)
