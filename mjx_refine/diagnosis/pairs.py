@@ -56,6 +56,7 @@ def pairs_of(
     clip: ClipFit,
     base: Fit,
     singles: tuple[Candidate, ...],
+    early: tuple[Candidate, ...],
     names: list[str],
     shown: Shown,
     seed: int,
@@ -67,6 +68,7 @@ def pairs_of(
       clip: residuals.
       base: the base model's fit.
       singles: every effect by itself, the best evidence first.
+      early: two effects that were found before.
       names: of the catalogue.
       shown: what a fit shows to those who look for a start.
       seed: of random hops.
@@ -77,7 +79,7 @@ def pairs_of(
     looks = clip.crew.each(clip, _second, [(first.fit, lead) for first, lead in beside], told, lines)
     fits = _best_joined(clip, looks, [first.fit.cost for first, _ in beside])
     found = [Candidate(fit, lead_of(fit, base), beside[k][1].gain) for k, fit in fits]
-    found += _annealed(clip, base, singles, names, shown, told)
+    found += early
     together = list(_together(clip, base, singles)) if beside else []
     lines = [f"{first.names[0]} and {second.names[0]}, together" for _, _, first, second in together]
     rows = [(hypothesis, z, min(first.fit.cost, second.fit.cost)) for hypothesis, z, first, second in together]
@@ -146,15 +148,35 @@ def _others(first: Fit, names: list[str]) -> list[str]:
     return [n for n in names if catalogue()[n].targeted or n not in {t.name for t in first.hypothesis.terms}]
 
 
-def _annealed(
-    clip: ClipFit, base: Fit, singles: tuple[Candidate, ...], names: list[str], shown: Shown, told: Told
-) -> list[Candidate]:
-    """Second effects beside the best ones with more noise than there is: there the first has not bent towards the second."""
-    firsts = _firsts(singles)
-    found = beside_tempered(clip, [one.fit for one in firsts], lambda fit: _others(fit, names), shown, told, SECONDS)
-    rival = min((one.fit.cost for one in firsts), default=np.inf)
+def annealed_pairs(
+    clip: ClipFit,
+    base: Fit,
+    singles: tuple[Candidate, ...],
+    unbent: list[Fit],
+    names: list[str],
+    shown: Shown,
+    told: Told,
+) -> tuple[Candidate, ...]:
+    """Two effects at once, the best evidence first, of which the second was found beside the first with more noise than there
+    is: there the first has not bent towards the second.
+
+    Args:
+      clip: residuals.
+      base: the base model's fit.
+      singles: every effect by itself, the best evidence first.
+      unbent: fits of some effects by themselves with more noise, the best first.
+      names: of the catalogue.
+      shown: what a fit shows to those who look for a start.
+      told: called with a line for each step.
+    """
+    straight = _differing([Candidate(fit, 0.0, 0.0) for fit in unbent])[:FIRSTS]
+    firsts = [one for one in _firsts(singles) if not any(_one_cause(one, other) for other in straight)]
+    grounds = ([one.fit for one in firsts], [one.fit for one in straight])
+    found = beside_tempered(clip, *grounds, lambda fit: _others(fit, names), shown, told, SECONDS)
+    rival = singles[0].fit.cost
     fits = clip.crew.each(clip, _cooled, [(fit, rival) for _, fit in found[:COOLED]])
-    return [Candidate(fit, lead_of(fit, base), lead.gain) for (lead, _), fit in zip(found, fits, strict=False)]
+    twos = [Candidate(fit, lead_of(fit, base), lead.gain) for (lead, _), fit in zip(found, fits, strict=False)]
+    return in_order(clip, _differing(sorted(twos, key=lambda one: -one.lead)))
 
 
 def _cooled(clip: ClipFit, fit: Fit, rival: float) -> Fit:

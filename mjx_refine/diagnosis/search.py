@@ -15,7 +15,7 @@ from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import FIRST, FORGIVING, begun, chosen_of
 from mjx_refine.diagnosis.measure import Measured, measure
-from mjx_refine.diagnosis.pairs import Told, pairs_of
+from mjx_refine.diagnosis.pairs import Told, annealed_pairs, pairs_of
 from mjx_refine.diagnosis.patches import patches_from_pushes
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
@@ -107,26 +107,39 @@ def compare(
     impacts = clip.allow_slack(base)
     base = _of_own_contacts(clip, clip.fit(base.hypothesis, base.z, 10))
     names = [name for name in catalogue() if name not in without]
-    base, singles = _singles(clip, base, names, scene, observation, masks_of, seed, told, begin is None)
+    base, singles, unbent = _singles(clip, base, names, scene, observation, masks_of, seed, told, begin is None)
+
+    def shown(fit: Fit) -> FitView:
+        return view_of(clip, fit, observation, masks_of)
+
+    twos: tuple[Candidate, ...] = ()
+    if begin is None and singles and singles[0].lead > CLEAR:
+        twos = annealed_pairs(clip, base, singles, unbent, names, shown, told)
+        singles = _as_found_together(clip, base, singles, twos)
     if (thin := thinness(singles)) > THIN and clip.leave_out(_may_be_cut(clip, observation, masks_of, thin)):
         told("thin masks, without what other objects may hide of them")
-        base, singles, impacts = _again(clip, base, singles, seed)
+        base, singles, twos, impacts = _again(clip, base, singles, twos, seed)
     if singles and singles[0].lead > CLEAR:
         told("noise, once more")
-        base, singles, impacts = _again(clip, base, singles, seed)
-    pairs = pairs_of(clip, base, singles, names, lambda fit: view_of(clip, fit, observation, masks_of), seed, told)
+        base, singles, twos, impacts = _again(clip, base, singles, twos, seed)
+    pairs = pairs_of(clip, base, singles, twos, names, shown, seed, told)
     return Compared(base, _as_found_together(clip, base, singles, pairs), pairs, impacts)
 
 
 def _singles(
     clip: ClipFit, base: Fit, names, scene, observation, masks_of, seed: int, told: Told, video: bool
-) -> tuple[Fit, tuple[Candidate, ...]]:
+) -> tuple[Fit, tuple[Candidate, ...], list[Fit]]:
     fitted: Fitted = {}
+    unbent: list[Fit] = []
     walled: list[Fit] = []
     tried: Fit | None = None
+
+    def shown(fit: Fit) -> FitView:
+        return view_of(clip, fit, observation, masks_of)
+
     for again in range(2):
         told("looking ahead")
-        view = view_of(clip, base, observation, masks_of)
+        view = shown(base)
         ahead = Screen(clip, base, view)
         chosen = chosen_of(ahead.leads(names), FAMILIES if again == 0 else 3)
         rows = [(base, lead, SCALE) for lead in chosen]
@@ -134,9 +147,9 @@ def _singles(
             # The base model's fit has bent its parameters towards the effect; from the given scene the way is straight.
             rows += [(base, lead, SCALE) for lead in ahead.away(names)]
             if video:
-                _keep_annealed(
-                    clip, base, fitted, names, lambda fit: view_of(clip, fit, observation, masks_of), told, scene
-                )
+                ended, unbent = annealed(clip, base, names, shown, seed, told, lambda lead: words(lead, scene))
+                for lead, fit in ended:
+                    _keep(fitted, (lead.name, lead.target), fit, lead.gain)
             else:
                 rows += _from_given(clip, base, names, observation, masks_of)
         _keep_leads(clip, base, fitted, rows, told, scene)
@@ -165,7 +178,7 @@ def _singles(
         base, fitted = exchanged(clip, base, fitted)
     fitted = at_least_nothing(clip, base, fitted)
     finals = [Candidate(fit, lead_of(fit, base), promise) for fit, promise in fitted.values()]
-    return base, in_order(clip, finals)
+    return base, in_order(clip, finals), unbent
 
 
 def _from_given(clip: ClipFit, base: Fit, names, observation, masks_of) -> list[Row]:
@@ -175,19 +188,6 @@ def _from_given(clip: ClipFit, base: Fit, names, observation, masks_of) -> list[
     looked = Screen(clip, zero, view_of(clip, zero, observation, masks_of), FORGIVING)
     leads = [*chosen_of(looked.leads(names), FRESH, 1), *chosen_of(looked.away(names), FRESH)]
     return [(zero, lead, FORGIVING) for lead in leads]
-
-
-def _keep_annealed(
-    clip: ClipFit, base: Fit, fitted: Fitted, names, shown: Callable[[Fit], FitView], told: Told, scene: Scene
-) -> None:
-    """The same of a video, whose scene a refinement may have bent: there noise begins larger than it is."""
-    told("looking ahead from the given scene")
-
-    def line(lead: Lead) -> str:
-        return f"{lead.name} {target_name(scene.names, lead.target)}".strip()
-
-    for lead, fit in annealed(clip, base, names, shown, told, line):
-        _keep(fitted, (lead.name, lead.target), fit, lead.gain)
 
 
 def _from_the_best(
@@ -248,7 +248,7 @@ def _of_own_contacts(clip: ClipFit, base: Fit) -> Fit:
 
 def _keep_leads(clip: ClipFit, base: Fit, fitted: Fitted, rows: list[Row], told: Told, scene: Scene) -> None:
     """Fits leads from where they were seen, to the end where they may become the best, and keeps what is best of its family."""
-    lines = [f"{lead.name} {target_name(scene.names, lead.target)}".strip() for _, lead, _ in rows]
+    lines = [words(lead, scene) for _, lead, _ in rows]
     fits = clip.crew.each(clip, _begun, [(*row, base.cost) for row in rows], told, lines)
     least = min([base.cost, *(fit.cost for fit, _ in fitted.values()), *(fit.cost for fit in fits)])
     bound = least + max(CLOSE, SOME_OF_IT * (base.cost - least))
@@ -312,10 +312,10 @@ def _in_place_of_pushes(
 
 
 def _again(
-    clip: ClipFit, base: Fit, singles: tuple[Candidate, ...], seed: int
-) -> tuple[Fit, tuple[Candidate, ...], int]:
-    """All fits once more with the noise that the best effect leaves, in whose changes from frame to frame is little misfit."""
-    best = singles[0].fit
+    clip: ClipFit, base: Fit, singles: tuple[Candidate, ...], twos: tuple[Candidate, ...], seed: int
+) -> tuple[Fit, tuple[Candidate, ...], tuple[Candidate, ...], int]:
+    """All fits once more with the noise that the best one leaves, in whose changes from frame to frame is little misfit."""
+    best = (twos if twos and twos[0].lead > singles[0].lead + CLEAR else singles)[0].fit
     for _ in range(SETTLINGS):
         taken = clip.measured.moment_noise
         clip.settle_noise(best, order=1)
@@ -324,12 +324,11 @@ def _again(
             break
     clip.allow_chaos(best, seed)
     impacts = clip.allow_slack(best)
-    rows = [(base, 10), *((one.fit, 8) for one in singles[:KEPT])]
-    base, *fits = clip.crew.each(clip, _refitted, rows)
-    found = [
-        dataclasses.replace(one, fit=fit, lead=lead_of(fit, base)) for one, fit in zip(singles, fits, strict=False)
-    ]
-    return base, in_order(clip, found), impacts
+    kept = [*singles[:KEPT], *twos]
+    base, *fits = clip.crew.each(clip, _refitted, [(base, 10), *((one.fit, 8) for one in kept)])
+    found = [dataclasses.replace(one, fit=fit, lead=lead_of(fit, base)) for one, fit in zip(kept, fits, strict=True)]
+    count = len(singles[:KEPT])
+    return base, in_order(clip, found[:count]), in_order(clip, found[count:]), impacts
 
 
 def thinness(singles: tuple[Candidate, ...]) -> float:
@@ -357,6 +356,11 @@ def _along_its_own(clip: ClipFit, fit: Fit) -> Fit:
 def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:
     fit = _along_its_own(clip, fit)
     return knocked(clip, clip.fit(fit.hypothesis, fit.z, iterations))
+
+
+def words(lead: Lead, scene: Scene) -> str:
+    """What an effect that is fitted is called."""
+    return f"{lead.name} {target_name(scene.names, lead.target)}".strip()
 
 
 def target_name(names: tuple[str, ...], target: int) -> str:

@@ -18,6 +18,7 @@ from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import beginning, chosen_of
+from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.effects.kind import FitView
 
@@ -27,8 +28,9 @@ WARM, COOLER = 10.0, 3.0
 GROUND, FIRST, FURTHER, LAST = 10, 8, 6, 9
 """Iterations of the base model, of effects beside it, of both with less noise, and with the noise as it is."""
 
-FAMILIES, GO_ON, END = 10, 6, 4
-"""Effects and targets that are fitted with the most noise, those that go on with less, and those that go on to the end."""
+FAMILIES, GO_ON, END, ROAMING = 10, 6, 4, 3
+"""Effects and targets that are fitted with the most noise, those that go on with less, those that go on to the end, and
+those that look around their ends before."""
 
 Shown = Callable[[Fit], FitView]
 Told = Callable[[str], None]
@@ -46,47 +48,61 @@ def tempered(clip: ClipFit, factor: float) -> Iterator[None]:
 
 
 def annealed(
-    clip: ClipFit, base: Fit, names: list[str], shown: Shown, told: Told, lines: Callable[[Lead], str]
-) -> list[tuple[Lead, Fit]]:
-    """The most promising effects, each with where its fit ends once the noise has fallen to what it is.
+    clip: ClipFit, base: Fit, names: list[str], shown: Shown, seed: int, told: Told, lines: Callable[[Lead], str]
+) -> tuple[list[tuple[Lead, Fit]], list[Fit]]:
+    """The most promising effects, each with where its fit ends once the noise has fallen to what it is; and where those stood
+    when there was more of it, the cheapest first.
 
     Args:
       clip: residuals.
       base: the base model's fit; what costs far more in the end is given up.
       names: of the catalogue.
       shown: what a fit shows to those who look for a start.
+      seed: of random hops.
       told: called with a line for each step.
       lines: the line of a lead.
     """
     plain = dataclasses.replace(base.hypothesis, slack=None)
     with tempered(clip, WARM):
-        ground = clip.fit(plain, np.zeros(plain.dimension), GROUND)
+        ground = clip.roam(clip.fit(plain, np.zeros(plain.dimension), GROUND), seed, ROAMED_AGAIN)
         leads = chosen_of(Screen(clip, ground, shown(ground)).leads(names), FAMILIES, 1)
         rows = [(ground, lead) for lead in leads]
         fits = clip.crew.each(clip, _first, rows, told, [lines(lead) for lead in leads])
     found = _cheapest(list(zip(leads, fits, strict=True)), GO_ON)
     with tempered(clip, COOLER):
         fits = clip.crew.each(clip, _further, [(fit,) for _, fit in found])
-    found = _cheapest([(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)], END)
-    fits = clip.crew.each(clip, _last, [(fit, base.cost) for _, fit in found])
-    return [(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)]
+        found = _cheapest([(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)], END)
+        fits = clip.crew.each(clip, _roamed, [(fit, seed) for _, fit in found[:ROAMING]])
+    unbent = [*fits, *(fit for _, fit in found[ROAMING:])]
+    fits = clip.crew.each(clip, _last, [(fit, base.cost) for fit in unbent])
+    ended = [(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)]
+    return ended, sorted(unbent, key=lambda fit: fit.cost)
 
 
 def beside_tempered(
-    clip: ClipFit, firsts: list[Fit], names_beside: Callable[[Fit], list[str]], shown: Shown, told: Told, seconds: int
+    clip: ClipFit,
+    firsts: list[Fit],
+    unbent: list[Fit],
+    names_beside: Callable[[Fit], list[str]],
+    shown: Shown,
+    told: Told,
+    seconds: int,
 ) -> list[tuple[Lead, Fit]]:
     """Fits of a second effect beside each of some first ones, with more noise than there is; the cheapest first.
 
     Args:
       clip: residuals.
       firsts: fits with one effect.
+      unbent: the same, of others, made with more noise.
       names_beside: of the effects that are looked for beside one.
       shown: what a fit shows to those who look for a start.
       told: called with a line for each step.
       seconds: how many second effects are fitted beside each.
     """
-    with tempered(clip, COOLER):
+    with tempered(clip, WARM):
         grounds = clip.crew.each(clip, _further, [(_plain(fit),) for fit in firsts])
+    with tempered(clip, COOLER):
+        grounds = clip.crew.each(clip, _further, [(ground,) for ground in grounds]) + unbent
         rows: list[tuple[Fit, Lead]] = []
         for ground in grounds:
             one = ground.hypothesis.terms[0]
@@ -121,6 +137,10 @@ def _first(clip: ClipFit, ground: Fit, lead: Lead) -> Fit:
 
 def _further(clip: ClipFit, fit: Fit) -> Fit:
     return clip.fit(fit.hypothesis, fit.z, FURTHER)
+
+
+def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
+    return clip.roam(fit, seed, ROAMED_AGAIN)
 
 
 def _last(clip: ClipFit, fit: Fit, rival: float) -> Fit:
