@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from mjx_refine.children import cores
 from mjx_refine.compile_cache import enable_cache
@@ -18,10 +16,10 @@ from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared
 from mjx_refine.diagnosis.crew import Crew, crew_of
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import HeldOut, held_out
-from mjx_refine.diagnosis.hypothesis import Term
 from mjx_refine.diagnosis.measure import Measured, measure
+from mjx_refine.diagnosis.numbers import tied, values_at
 from mjx_refine.diagnosis.replay import Replay, replays
-from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Value, Verdict
+from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Verdict
 from mjx_refine.diagnosis.search import compare
 from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.diagnosis.signs import MOSTLY, Signs, best_candidate, map_of, signs
@@ -46,9 +44,6 @@ LEAST_IOU = 0.05
 
 LEAST_MOTION = 1.0
 """How far something must move [px]."""
-
-TIED = 0.95
-"""Correlation of two numbers of an effect from which a note says so."""
 
 TO_THE_NOISE = 1.5
 """Gap, over what noise alone leaves, up to which the base model is said to explain a clip."""
@@ -253,7 +248,7 @@ def _result(
         map_before=map_before,
         map_after=map_after,
         channels=channels,
-        notes=_notes(clip, compared, said, matching, names, best),
+        notes=(*_unmatched(problem.seen.ids, matching), *_notes(clip, compared, said, matching, names, best)),
         signs=dataclasses.asdict(found),
         seconds=time.monotonic() - began,
         rollouts=int(clip.rollouts),
@@ -295,7 +290,7 @@ def ranked(clip: ClipFit, compared: Compared, said: Answer, outside: HeldOut, be
             closed = float(np.clip((base_rms - after) / max(base_rms - min(floor, after), 1e-6), -1.0, 1.0))
         sentence = t.kind.sentence.format(target=target or "", shape=shapes[t.target] if t.target >= 0 else "")
         return Ranked(
-            t.name, target, probability, candidate.lead, _values(clip, candidate.fit, k), after, closed, sentence
+            t.name, target, probability, candidate.lead, values_at(clip, candidate.fit, k), after, closed, sentence
         )
 
     pair = best is not None and len(best.names) > 1
@@ -315,66 +310,16 @@ def _rms(clip: ClipFit, fit: Fit) -> float:
     return float(np.sqrt(clip.misfit(fit)))
 
 
-def _values(clip: ClipFit, fit: Fit, k: int) -> dict[str, Value]:
-    """Parameters of one effect with 90 % intervals from the curvature, widened where the fit leaves more than noise."""
-    hypothesis = fit.hypothesis
-    covariance = np.linalg.inv(fit.curvature) * max(1.0, clip.misfit(fit))
-    first = hypothesis.space.dimension + sum(int(o.free.sum()) for o in hypothesis.terms[:k])
-    values = hypothesis.values(fit.z[None], k)[0]
-    return values_of(hypothesis.terms[k], values, np.sqrt(np.diag(covariance))[first:], clip.frames)
-
-
-def values_of(
-    term: Term, values: Float[np.ndarray, "values"], deviation: Float[np.ndarray, "coordinates"], frames: int
-) -> dict[str, Value]:
-    """Parameters of an effect with 90 % intervals; of what has many numbers their root mean square.
-
-    Args:
-      term: the effect.
-      values: all its numbers.
-      deviation: standard errors in prior widths, those of the term's free coordinates first.
-      frames: of the clip.
-    """
-    wide_all = np.zeros(len(term.centre))
-    wide_all[term.free] = 1.645 * deviation[: int(term.free.sum())] * term.width[term.free]
-    result: dict[str, Value] = {}
-    at = 0
-    for p in term.kind.parameters:
-        count = 1 if p.length == 0 else (frames if p.length < 0 else p.length)
-        part, wide = values[at : at + count], wide_all[at : at + count]
-        at += count
-        if p.length == 0:
-            low, high = max(float(part[0] - wide[0]), p.low), min(float(part[0] + wide[0]), p.high)
-            result[p.name] = Value(float(part[0]), low, high, p.unit)
-        else:
-            centred = part - part.mean() if p.length < 0 else part
-            size, error = (float(np.sqrt(np.mean(row**2))) for row in (centred, wide))
-            result[f"{p.name}_rms"] = Value(size, max(size - error, 0.0), size + error, p.unit)
-    if term.name == "camera_shake":
-        halves = values.reshape(2, -1)
-        size = float(np.sqrt(np.mean((halves - halves.mean(1, keepdims=True)) ** 2)))
-        result["amplitude"] = Value(size, 0.9 * size, 1.1 * size, "degree")
-    return result
-
-
-def tied(fit: Fit) -> list[str]:
-    """Sentences about numbers of one effect that do each other's work."""
-    covariance = np.linalg.inv(fit.curvature)
-    correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
-    first, told = fit.hypothesis.space.dimension, []
-    for t in fit.hypothesis.terms:
-        free = np.nonzero(t.free)[0]
-        names = [p.name for p in t.kind.parameters]
-        if all(p.length == 0 for p in t.kind.parameters):
-            for i, j in itertools.combinations(range(len(free)), 2):
-                rho = float(correlation[first + i, first + j])
-                if abs(rho) > TIED:
-                    told.append(
-                        f"{names[free[i]]} and {names[free[j]]} of {t.name} do each other's work in this clip (correlation "
-                        f"{rho:.2f}): what is known is their combination."
-                    )
-        first += len(free)
-    return told
+def _unmatched(masks: Sequence[int], matching: Sequence[int]) -> list[str]:
+    """A sentence about masks that no object belongs to, or nothing."""
+    lost = sorted(set(masks) - set(matching))
+    if not lost:
+        return []
+    which = f"mask {lost[0]}" if len(lost) == 1 else f"masks {', '.join(map(str, lost))}"
+    return [
+        f"No object of the scene belongs to {which}: what is seen there is not simulated, and what it does to the others counts "
+        "as a misfit; if it should be simulated, diagnose with a scene that holds it."
+    ]
 
 
 def _notes(clip: ClipFit, compared: Compared, said: Answer, matching, names, best: Candidate | None) -> tuple[str, ...]:

@@ -111,7 +111,7 @@ AT_WORK = {"likely": 0.83, "less": 0.58, "unknown": 0.1, "none": 0.04, "perhaps 
 """How often the effect that leads most was at work on seeds 6 to 8, alone or with others: where it is named (58 of 70; where less
 likely, or one of two, 26 of 45), and where it is not (3 of 30, 2 of 54, 7 of 35)."""
 
-LIKELY_OF_A_VIDEO, AT_WORK_OF_A_VIDEO = 0.83, {AT_WORK["likely"]: 0.92, AT_WORK["unknown"]: 0.17}
+LIKELY_OF_A_VIDEO, AT_WORK_OF_A_VIDEO = 0.83, {"likely": 0.92, "unknown": 0.17}
 """The first level of one video, and how often the effect that leads most was at work there, in place of the above where something
 is named and of ``unknown``. Counted on seeds 20 and 21 of the withheld exams, the first two since contacts excuse less: 54 of 62
 right, where 0.72 had been said, and 54 of 68, where 0.86 had; 55 of 59 single effects named; 7 of 34 where ``unknown`` was
@@ -173,46 +173,60 @@ def _forced(told: Signs) -> bool:
     return told.unnamed > (UNNAMED if told.aloft else UNNAMED_ON_THE_FLOOR)
 
 
-def counted(said: Answer) -> Answer:
-    """The answer with the levels of probability that were counted on single videos."""
-    if said.probability != LIKELY:
-        return said
-    at_work = AT_WORK_OF_A_VIDEO.get(said.at_work, said.at_work)
-    return dataclasses.replace(said, probability=LIKELY_OF_A_VIDEO, at_work=at_work)
+@dataclasses.dataclass(frozen=True)
+class _Levels:
+    """Of what nothing else speaks against: how often it is right, and how often the leading effect is at work by what is said."""
+
+    likely: float
+    at_work: dict[str, float]
+
+    @classmethod
+    def of(cls, video: bool) -> _Levels:
+        """Of one video, or of anything else."""
+        if video:
+            return cls(LIKELY_OF_A_VIDEO, AT_WORK | AT_WORK_OF_A_VIDEO)
+        return cls(LIKELY, AT_WORK)
+
+    def unknown(self, shares: tuple[float, ...]) -> Answer:
+        """That something is missing which has no name."""
+        return Answer("unknown", self.likely, shares, self.at_work["unknown"])
 
 
 def _answered(told: Signs, shares: tuple[float, ...], video: bool) -> Answer:
+    levels = _Levels.of(video)
     if video and told.background > STILL:
-        return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
+        return levels.unknown(shares)
     if _slight(told, video):
         if told.structure_after > ODD or told.whole > RESTLESS or (video and told.after > FAR_OFF):
-            return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
+            return levels.unknown(shares)
         if video and told.aloft and told.unnamed > NAMED:
-            return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
+            return levels.unknown(shares)
         if told.held_out > UNSEEN:
-            return Answer("none", UNLIKELY, shares, AT_WORK["perhaps none"])
-        return Answer("none", LIKELY, shares, AT_WORK["none"])
+            return Answer("none", UNLIKELY, shares, levels.at_work["perhaps none"])
+        return Answer("none", levels.likely, shares, levels.at_work["none"])
     bends = told.closed < CLOSES and not (video and told.inimitable and told.held_out > ASKED)
     sure = video and bool(told.unmistakable)
     if bends or (video and told.after > FAR_OFF and not sure):
-        return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
+        return levels.unknown(shares)
     if video and not sure and _forced(told):
-        return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
+        return levels.unknown(shares)
     paired = _paired(told, video)
     if paired and sure and told.structure_after > _allowed(told, paired, video):
         paired = False
-    # Where one effect is named, what it leaves by itself counts.
+    # Where one effect is named, what it leaves by itself counts, and not what two would leave that are not named.
     alone = video and not paired and not told.inimitable and not sure
-    left = max(told.structure_after, told.structure_first) if alone else told.structure_after
+    left = told.structure_first if alone else told.structure_after
     if left > _allowed(told, paired, video) and not sure:
-        return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
+        return levels.unknown(shares)
     if paired:
-        return Answer("pair", LIKELY if video else UNLIKELY, shares, AT_WORK["likely" if video else "less"])
+        return Answer(
+            "pair", levels.likely if video else UNLIKELY, shares, levels.at_work["likely" if video else "less"]
+        )
     if alone and told.closed < WEAK and left > CLEAN:
-        return Answer("unknown", LIKELY, shares, AT_WORK["unknown"])
+        return levels.unknown(shares)
     if told.pair > MORE * np.sqrt(1 + max(told.margin, 0.0) / 20):
-        return Answer("single", UNLIKELY, shares, AT_WORK["less"])
-    return Answer("single", LIKELY, shares, AT_WORK["likely"])
+        return Answer("single", UNLIKELY, shares, levels.at_work["less"])
+    return Answer("single", levels.likely, shares, levels.at_work["likely"])
 
 
 def _slight(told: Signs, video: bool) -> bool:
@@ -240,8 +254,8 @@ def upheld(
     """
     two = said.kind == "single" and best_candidate(compared) is not compared.candidates[0]
     if two and not (told.inimitable and told.held_out > ASKED) and closed_of(compared.candidates[0].fit) < CLOSES:
-        said = Answer("unknown", LIKELY, said.shares, AT_WORK["unknown"])
-    return counted(said) if video else said
+        return _Levels.of(video).unknown(said.shares)
+    return said
 
 
 def _allowed(told: Signs, paired: bool, video: bool) -> float:

@@ -189,7 +189,7 @@ def describe(clip: ClipFit, fit: Fit, view: FitView) -> str:
     shift = np.nan_to_num(reach) @ directions(DIRECTIONS) * 2 / DIRECTIONS
     way = -shift[frames].mean(0) if len(frames) else np.zeros(2)
     size = np.linalg.norm(way)
-    compass = _compass(way) if size > 0.3 else "in no steady direction"
+    compass = f"{_compass(way)} the simulation" if size > 0.3 else "in no steady direction from the simulation"
     speed = np.linalg.norm(view.velocity[:, n], axis=-1)
     strength = np.linalg.norm(shift, axis=-1)
     link = (
@@ -198,7 +198,7 @@ def describe(clip: ClipFit, fit: Fit, view: FitView) -> str:
     words = [
         f"{names[n]} is off by {np.sqrt((shift[frames] ** 2).sum(-1).mean()) if len(frames) else 0.0:.1f} px (root mean square) "
         f"in frames {int(frames[0]) if len(frames) else 0}-{int(frames[-1]) if len(frames) else 0}, "
-        f"the clip lying {compass} of the simulation"
+        f"the clip lying {compass}"
     ]
     if abs(link) > 0.5:
         words.append(f"the misfit {'grows' if link > 0 else 'shrinks'} with its speed")
@@ -209,11 +209,12 @@ def describe(clip: ClipFit, fit: Fit, view: FitView) -> str:
 
 
 def _compass(way: np.ndarray) -> str:
-    horizontal = "right" if way[0] > 0 else "left"
+    """Where something lies, to be followed by what from."""
+    horizontal = "to the right of" if way[0] > 0 else "to the left of"
     vertical = "below" if way[1] > 0 else "above"
     if abs(way[0]) > 2 * abs(way[1]):
-        return f"to the {horizontal}"
-    return vertical if abs(way[1]) > 2 * abs(way[0]) else f"{vertical} and to the {horizontal}"
+        return horizontal
+    return vertical if abs(way[1]) > 2 * abs(way[0]) else f"{vertical} and {horizontal}"
 
 
 def _distances(clip: ClipFit, fit: Fit) -> np.ndarray:

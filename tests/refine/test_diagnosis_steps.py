@@ -10,12 +10,12 @@ from test_diagnosis_replay import started
 
 from mjx_refine.diagnosis.chaos import DRAWS, EXCUSED, believed, drawn, jaggedness
 from mjx_refine.diagnosis.crew import Crew
-from mjx_refine.diagnosis.diagnose import tied
 from mjx_refine.diagnosis.exchange import at_least_nothing, exchanged
 from mjx_refine.diagnosis.fitted import Fit
 from mjx_refine.diagnosis.hypothesis import term
 from mjx_refine.diagnosis.measure import Parts, moment_roughness
 from mjx_refine.diagnosis.noise import Counts, settled
+from mjx_refine.diagnosis.numbers import tied
 from mjx_refine.diagnosis.pace import ATTEMPTS, STEPS, damped, descended, updated
 from mjx_refine.diagnosis.roam import Strategy
 
