@@ -147,7 +147,7 @@ def _singles(
             # The base model's fit has bent its parameters towards the effect; from the given scene the way is straight.
             rows += [(base, lead, SCALE) for lead in ahead.away(names)]
             if video:
-                ended, unbent = annealed(clip, base, names, shown, seed, told, lambda lead: words(lead, scene))
+                base, ended, unbent = annealed(clip, base, names, shown, seed, told, lambda lead: words(lead, scene))
                 for lead, fit in ended:
                     _keep(fitted, (lead.name, lead.target), fit, lead.gain)
             else:

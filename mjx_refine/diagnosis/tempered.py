@@ -49,9 +49,9 @@ def tempered(clip: ClipFit, factor: float) -> Iterator[None]:
 
 def annealed(
     clip: ClipFit, base: Fit, names: list[str], shown: Shown, seed: int, told: Told, lines: Callable[[Lead], str]
-) -> tuple[list[tuple[Lead, Fit]], list[Fit]]:
-    """The most promising effects, each with where its fit ends once the noise has fallen to what it is; and where those stood
-    when there was more of it, the cheapest first.
+) -> tuple[Fit, list[tuple[Lead, Fit]], list[Fit]]:
+    """The base model's fit and those of the most promising effects, where they end once the noise has fallen to what it is; and
+    where the effects' stood when there was more of it, the cheapest first.
 
     Args:
       clip: residuals.
@@ -70,13 +70,15 @@ def annealed(
         fits = clip.crew.each(clip, _first, rows, told, [lines(lead) for lead in leads])
     found = _cheapest(list(zip(leads, fits, strict=True)), GO_ON)
     with tempered(clip, COOLER):
-        fits = clip.crew.each(clip, _further, [(fit,) for _, fit in found])
+        ground, *fits = clip.crew.each(clip, _further, [(ground,), *((fit,) for _, fit in found)])
         found = _cheapest([(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)], END)
-        fits = clip.crew.each(clip, _roamed, [(fit, seed) for _, fit in found[:ROAMING]])
+        # The base model goes the same way: else an effect would lead that has only found better ordinary numbers.
+        ground, *fits = clip.crew.each(clip, _roamed, [(ground, seed), *((fit, seed) for _, fit in found[:ROAMING])])
     unbent = [*fits, *(fit for _, fit in found[ROAMING:])]
-    fits = clip.crew.each(clip, _last, [(fit, base.cost) for fit in unbent])
+    ground, *fits = clip.crew.each(clip, _last, [(fit, base.cost) for fit in [ground, *unbent]])
     ended = [(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)]
-    return ended, sorted(unbent, key=lambda fit: fit.cost)
+    best = max(base, ground, key=lambda fit: fit.evidence)
+    return best, ended, sorted(unbent, key=lambda fit: fit.cost)
 
 
 def beside_tempered(
