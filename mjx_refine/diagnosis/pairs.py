@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float
@@ -17,10 +17,9 @@ from mjx_refine.diagnosis.leads import beginning, chosen_of
 from mjx_refine.diagnosis.patches import patches_from_pushes
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
-from mjx_refine.diagnosis.tempered import beside_tempered, cooled
+from mjx_refine.diagnosis.tempered import Shown, Told, beside_tempered, cooled
 from mjx_refine.diagnosis.walls import push_last, walls_from_pushes
 from mjx_refine.effects import catalogue
-from mjx_refine.effects.kind import FitView
 
 SECOND_PROMISE = 8.0
 """Evidence that the linear look must promise for a second effect to be fitted beside the first."""
@@ -47,9 +46,6 @@ ROAMING = 2
 
 WALLS = 2
 """How many of the best twos with a push are looked at with an obstacle, or a patch of the floor, in its place."""
-
-Told = Callable[[str], None]
-Shown = Callable[[Fit], FitView]
 
 
 def pairs_of(

@@ -15,12 +15,12 @@ from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import FIRST, FORGIVING, begun, chosen_of
 from mjx_refine.diagnosis.measure import Measured, measure
-from mjx_refine.diagnosis.pairs import Told, annealed_pairs, pairs_of
+from mjx_refine.diagnosis.pairs import annealed_pairs, pairs_of
 from mjx_refine.diagnosis.patches import patches_from_pushes
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.tempered import annealed
+from mjx_refine.diagnosis.tempered import Shown, Told, annealed
 from mjx_refine.diagnosis.walls import walls_from_pushes
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
@@ -107,13 +107,14 @@ def compare(
     impacts = clip.allow_slack(base)
     base = _of_own_contacts(clip, clip.fit(base.hypothesis, base.z, 10))
     names = [name for name in catalogue() if name not in without]
-    base, singles, unbent = _singles(clip, base, names, scene, observation, masks_of, seed, told, begin is None)
+    video = begin is None
 
     def shown(fit: Fit) -> FitView:
         return view_of(clip, fit, observation, masks_of)
 
+    base, singles, unbent = _singles(clip, base, names, scene, shown, seed, told, video)
     twos: tuple[Candidate, ...] = ()
-    if begin is None and singles and singles[0].lead > CLEAR:
+    if video and singles and singles[0].lead > CLEAR:
         twos = annealed_pairs(clip, base, singles, unbent, names, shown, told)
         singles = _as_found_together(clip, base, singles, twos)
     if (thin := thinness(singles)) > THIN and clip.leave_out(_may_be_cut(clip, observation, masks_of, thin)):
@@ -127,16 +128,12 @@ def compare(
 
 
 def _singles(
-    clip: ClipFit, base: Fit, names, scene, observation, masks_of, seed: int, told: Told, video: bool
+    clip: ClipFit, base: Fit, names, scene: Scene, shown: Shown, seed: int, told: Told, video: bool
 ) -> tuple[Fit, tuple[Candidate, ...], list[Fit]]:
     fitted: Fitted = {}
     unbent: list[Fit] = []
     walled: list[Fit] = []
     tried: Fit | None = None
-
-    def shown(fit: Fit) -> FitView:
-        return view_of(clip, fit, observation, masks_of)
-
     for again in range(2):
         told("looking ahead")
         view = shown(base)
@@ -151,7 +148,7 @@ def _singles(
                 for lead, fit in ended:
                     _keep(fitted, (lead.name, lead.target), fit, lead.gain)
             else:
-                rows += _from_given(clip, base, names, observation, masks_of)
+                rows += _from_given(clip, base, names, shown)
         _keep_leads(clip, base, fitted, rows, told, scene)
         _in_place_of_pushes(clip, base, fitted, walled, view, names, told)
         best = max((fit for fit, _ in fitted.values()), key=lambda fit: fit.evidence, default=base)
@@ -164,7 +161,7 @@ def _singles(
         base = other if gain > 0 else base
         if gain < SLIGHT:
             break
-    _from_the_best(clip, base, fitted, names, observation, masks_of, told, scene)
+    _from_the_best(clip, base, fitted, names, shown, told, scene)
     base, fitted = exchanged(clip, base, fitted)
     first = sorted(fitted, key=lambda key: -fitted[key][0].evidence)[:ROAMING]
     most = max([0.0, *(lead_of(fitted[key][0], base) for key in first)])
@@ -181,18 +178,16 @@ def _singles(
     return base, in_order(clip, finals), unbent
 
 
-def _from_given(clip: ClipFit, base: Fit, names, observation, masks_of) -> list[Row]:
+def _from_given(clip: ClipFit, base: Fit, names, shown: Shown) -> list[Row]:
     """Leads from the given scene."""
     zero = clip.at(base.hypothesis, np.zeros(base.hypothesis.dimension), scale=FORGIVING)
     zero = clip.at(dataclasses.replace(zero.hypothesis, slack=clip.slack_along(zero)), zero.z, scale=FORGIVING)
-    looked = Screen(clip, zero, view_of(clip, zero, observation, masks_of), FORGIVING)
+    looked = Screen(clip, zero, shown(zero), FORGIVING)
     leads = [*chosen_of(looked.leads(names), FRESH, 1), *chosen_of(looked.away(names), FRESH)]
     return [(zero, lead, FORGIVING) for lead in leads]
 
 
-def _from_the_best(
-    clip: ClipFit, base: Fit, fitted: Fitted, names, observation, masks_of, told: Told, scene: Scene
-) -> None:
+def _from_the_best(clip: ClipFit, base: Fit, fitted: Fitted, names, shown: Shown, told: Told, scene: Scene) -> None:
     """Fits effects from where the best one's ordinary numbers are, with that effect gone: the base model's are bent towards
     it, and the best one's are not, whatever its name."""
     best = max(fitted, key=lambda key: fitted[key][0].evidence, default=None)
@@ -201,7 +196,7 @@ def _from_the_best(
     told("looking ahead from the best effect's numbers")
     z = fitted[best][0].z[: base.hypothesis.dimension]
     ground = clip.at(dataclasses.replace(base.hypothesis, slack=fitted[best][0].hypothesis.slack), z, scale=FORGIVING)
-    leads = Screen(clip, ground, view_of(clip, ground, observation, masks_of), FORGIVING).leads(names)
+    leads = Screen(clip, ground, shown(ground), FORGIVING).leads(names)
     leads = [lead for lead in leads if (lead.name, lead.target) != best]
     rows = [(ground, lead, FORGIVING) for lead in chosen_of(leads, FROM_BEST, 1)]
     _keep_leads(clip, base, fitted, rows, told, scene)
