@@ -29,6 +29,10 @@ MOVES_CAMERA = ("camera_motion", "camera_shake")
 """Effects that the background shows, whatever objects do: one of these and another are named with less of a lead, too."""
 
 
+MOVES = ("motion", "rotation")
+"""Channels of effects that move the objects."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Signs:
     """What the answer is read from; leads are of evidence, in units of the misfit that the best hypothesis leaves.
@@ -47,6 +51,7 @@ class Signs:
       structure_first: ``structure_after`` of the best single effect.
       beside: 1 where one of the best two effects moves the camera, which the background shows, and the other does not, nor
         widens masks, as a camera that is not quite right seems to.
+      forces: 1 where both of the best two effects move the objects.
       inimitable: 1 where the best single effect is one that contacts which err do not imitate.
       unmistakable: 1 where the best single effect is one that nothing else looks like, and leads every other by far.
       pliant: 1 where the best single effect is one that bends to many others.
@@ -75,6 +80,7 @@ class Signs:
     aloft: float = 0.0
     background: float = 0.0
     drawn: float = 0.0
+    forces: float = 0.0
 
 
 def signs(clip: ClipFit, compared: Compared, held_out: float, closed: float = 1.0) -> Signs:
@@ -106,6 +112,7 @@ def signs(clip: ClipFit, compared: Compared, held_out: float, closed: float = 1.
         aloft=float(freed is not None and freed.on_floor < MOSTLY),
         background=unsteadiness(clip, after),
         drawn=float(clip.measured.drawn),
+        forces=float(bool(pairs) and all(t.kind.channel in MOVES for t in pairs[0].fit.hypothesis.terms)),
         beside=float(bool(pairs) and _beside([t.name for t in pairs[0].fit.hypothesis.terms])),
     )
 

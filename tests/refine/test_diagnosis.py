@@ -117,24 +117,28 @@ def test_what_the_background_shows_counts_whatever_effect_leads_a_little(monkeyp
     assert answer(told, [22.0]).kind == "unknown"
 
 
-def test_two_effects_are_beside_each_other_where_one_of_them_moves_the_camera(monkeypatch):
+def test_two_effects_are_beside_each_other_or_both_forces_by_what_they_change(monkeypatch):
     without_residuals(monkeypatch)
     clip = SimpleNamespace(misfit=lambda fit: 1.0, expected=lambda: 100.0, measured=SimpleNamespace(drawn=False))
 
     def fitted(*names):
-        terms = [SimpleNamespace(name=name) for name in names]
+        terms = [SimpleNamespace(name=name, kind=catalogue()[name]) for name in names]
         return SimpleNamespace(
             fit=SimpleNamespace(data=400.0, hypothesis=SimpleNamespace(terms=terms)), lead=9.0, names=names
         )
 
-    def beside(*names):
+    def told(*names):
         found = SimpleNamespace(base=fitted().fit, candidates=(fitted(names[0]),), pairs=(fitted(*names),), freed=None)
-        return signs(clip, found, 0.0).beside
+        return signs(clip, found, 0.0)
 
-    assert beside("push", "camera_motion") == beside("camera_shake", "drag") == 1.0
-    assert (
-        beside("push", "drag") == beside("camera_shake", "camera_motion") == beside("camera_motion", "mask_bias") == 0.0
-    )
+    for one, other in (("push", "camera_motion"), ("camera_shake", "drag")):
+        assert told(one, other).beside == 1.0
+    for one, other in (("push", "drag"), ("camera_shake", "camera_motion"), ("camera_motion", "mask_bias")):
+        assert told(one, other).beside == 0.0
+    for one, other in (("push", "drag"), ("offset_com", "wind")):
+        assert told(one, other).forces == 1.0
+    for one, other in (("shape", "wind"), ("camera_motion", "push")):
+        assert told(one, other).forces == 0.0
 
 
 @pytest.mark.parametrize(
@@ -172,12 +176,16 @@ def changed(changes):
         ({"lead": 3000.0, "pair": 200.0}, "single"),
         ({"lead": 3000.0, "pair": 200.0, "structure_first": 9.0}, "pair"),
         ({"lead": 3000.0, "pair": 200.0, "structure_first": 1.9}, "single"),
-        ({"pair": 90.0, "structure_first": 9.0}, "pair"),
+        ({"lead": 3000.0, "pair": 110.0, "structure_first": 9.0}, "pair"),
+        ({"pair": 90.0, "structure_first": 9.0}, "unknown"),
+        ({"pair": 390.0, "forces": 1.0}, "single"),
+        ({"pair": 390.0, "structure_first": 9.0, "forces": 1.0}, "unknown"),
+        ({"pair": 410.0, "forces": 1.0}, "pair"),
         ({"pair": 55.0, "structure_first": 9.0}, "unknown"),
         ({"pair": 55.0, "structure_first": 2.5}, "single"),
         ({"pair": 55.0, "structure_first": 9.0, "inimitable": 1.0}, "single"),
-        ({"pair": 65.0, "beside": 1.0}, "pair"),
-        ({"pair": 55.0, "beside": 1.0}, "single"),
+        ({"pair": 85.0, "beside": 1.0}, "pair"),
+        ({"pair": 75.0, "beside": 1.0}, "single"),
         ({"lead": 55.0, "structure_before": 3.9}, "none"),
         ({"lead": 35.0, "structure_before": 4.1}, "single"),
         ({"lead": 65.0, "structure_before": 1.9}, "single"),
@@ -228,6 +236,10 @@ def changed(changes):
         ({"closed": 0.05, "lead": 20.0}, "none"),
         ({"closed": 0.05, "lead": 55.0}, "none"),
         ({"closed": 0.05, "lead": 55.0, "structure_after": 1.4}, "unknown"),
+        ({"closed": 0.05, "lead": 110.0, "structure_before": 1.2}, "none"),
+        ({"closed": 0.05, "lead": 130.0, "structure_before": 1.2}, "unknown"),
+        ({"closed": 0.05, "lead": 110.0, "structure_before": 1.4}, "unknown"),
+        ({"closed": 0.15, "lead": 110.0, "structure_before": 1.2, "structure_after": 0.7}, "single"),
     ],
 )
 def test_the_answer_follows_the_signs(changes, kind):
