@@ -29,10 +29,6 @@ MOVES_CAMERA = ("camera_motion", "camera_shake")
 """Effects that the background shows, whatever objects do: one of these and another are named with less of a lead, too."""
 
 
-MOVES = ("motion", "rotation")
-"""Channels of effects that move the objects."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Signs:
     """What the answer is read from; leads are of evidence, in units of the misfit that the best hypothesis leaves.
@@ -112,7 +108,7 @@ def signs(clip: ClipFit, compared: Compared, held_out: float, closed: float = 1.
         aloft=float(freed is not None and freed.on_floor < MOSTLY),
         background=unsteadiness(clip, after),
         drawn=float(clip.measured.drawn),
-        forces=float(bool(pairs) and all(t.kind.channel in MOVES for t in pairs[0].fit.hypothesis.terms)),
+        forces=float(bool(pairs) and all(t.kind.physical for t in pairs[0].fit.hypothesis.terms)),
         beside=float(bool(pairs) and _beside([t.name for t in pairs[0].fit.hypothesis.terms])),
     )
 
