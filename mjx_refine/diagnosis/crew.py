@@ -26,7 +26,7 @@ import jax
 from mjx_refine.children import ONE_THREAD, exit_with_parent, inherited, pool, without_main
 from mjx_refine.diagnosis.settled import Settled
 from mjx_refine.diagnosis.store import Arrays, Borrowed, Store
-from mjx_refine.sim import recalled
+from mjx_refine.sim import cores, recalled
 
 log = logging.getLogger("mjx_refine")
 
@@ -50,7 +50,7 @@ class _Done:
 
 @dataclasses.dataclass(frozen=True)
 class _Order:
-    """What a process must know of a clip to do pieces, and how many threads it has for them."""
+    """What a process must know of a clip to do pieces, and how many threads it may have for them at most."""
 
     facts: str
     state: str
@@ -59,7 +59,7 @@ class _Order:
     threads: int
 
     @classmethod
-    def of(cls, clip: Any, threads: int = 1) -> _Order:
+    def of(cls, clip: Any, threads: int) -> _Order:
         return cls(clip.facts, clip.state(), clip.again(), clip.settled, threads)
 
 
@@ -68,12 +68,12 @@ class _Bench:
 
     def __init__(self):
         self.clip: Any = None
-        self.made, self.state = ("", 0), ""
+        self.made, self.state = "", ""
 
     def fetch(self, order: _Order) -> Any:
         """The clip as ordered, not yet counted or stored anything for."""
-        if self.made != (order.facts, order.threads):
-            self.clip, self.made, self.state = order.make(order.threads), (order.facts, order.threads), ""
+        if self.made != order.facts:
+            self.clip, self.made, self.state = order.make(order.threads), order.facts, ""
         if self.state != order.state:
             self.clip.settled, self.state = order.settled, order.state
         self.clip.rollouts = 0.0
@@ -83,13 +83,13 @@ class _Bench:
 class Crew:
     """Those who do pieces: this process alone, unless ``crew_of`` gave it others."""
 
-    def __init__(self, others: ProcessPoolExecutor | None = None, count: int = 0):
-        self._others, self._count, self._bench = others, count, _Bench()
+    def __init__(self, others: ProcessPoolExecutor | None = None, count: int = 0, threads: int = 1):
+        self._others, self._count, self._threads, self._bench = others, count, threads, _Bench()
 
     def warm(self, clip: Any) -> None:
         """Lets the other processes compile what they will need, while this one goes on."""
         if self._others is not None:
-            order = _Order.of(clip)
+            order = _Order.of(clip, self._threads)
             with contextlib.suppress(RuntimeError):
                 for _ in range(self._count):
                     self._others.submit(_warm, order)
@@ -127,8 +127,7 @@ class Crew:
         return [one.result for one in done]
 
     def _side_by_side(self, others, clip: Any, piece: Piece, rows, say: Callable[[int], None]) -> list[_Done]:
-        # Where there are fewer pieces than processes, each has the cores of several.
-        order, folder = _Order.of(clip, max(1, (self._count + 1) // len(rows))), clip.store.folder
+        order, folder = _Order.of(clip, self._threads), clip.store.folder
         left, arrived = iter(range(len(rows))), queue.SimpleQueue()
         done: dict[int, _Done] = {}
 
@@ -185,32 +184,39 @@ class Crew:
 def _alone(clip: Any, piece: Piece, row: tuple[Any, ...]) -> _Done:
     before, clip.rollouts = clip.rollouts, 0.0
     try:
-        result = piece(clip, *row)
+        with cores.PROCESS.at_work():
+            result = piece(clip, *row)
         return _Done(result, clip.rollouts, (), 0)
     finally:
         clip.rollouts = before
 
 
 @contextlib.contextmanager
-def crew_of(processes: int) -> Iterator[Crew]:
-    """A crew of so many processes with this one; the others begin at once and end with the block."""
-    count = min(processes, MOST) - 1
+def crew_of(threads: int) -> Iterator[Crew]:
+    """A crew for so many cores, this process among it; the others begin at once and end with the block.
+
+    Whoever has a piece also has the cores of those that have none.
+    """
+    count = min(threads, MOST) - 1
     # A daemon may have no children.
     if count < 1 or multiprocessing.current_process().daemon:
         yield Crew()
         return
+    working = multiprocessing.get_context("spawn").Value("i", 0)
     with (
         tempfile.TemporaryDirectory(prefix="mjx-refine-", ignore_cleanup_errors=True) as rollouts,
-        pool(count, _begin, (jax.config.jax_compilation_cache_dir, rollouts)) as others,
+        pool(count, _begin, (jax.config.jax_compilation_cache_dir, rollouts, threads, working)) as others,
     ):
         with without_main(), inherited(ONE_THREAD):
             for _ in range(count):
                 others.submit(_begun)
         recalled.PROCESS.share(Path(rollouts))
+        cores.PROCESS.share(threads, working)
         try:
-            yield Crew(others, count)
+            yield Crew(others, count, threads)
         finally:
             recalled.PROCESS.share(None)
+            cores.PROCESS.release()
 
 
 # --- the other processes ----------------------------------------------------------------------------------------------
@@ -218,10 +224,11 @@ def crew_of(processes: int) -> Iterator[Crew]:
 _BENCH = _Bench()
 
 
-def _begin(cache: str | None, rollouts: str) -> None:
+def _begin(cache: str | None, rollouts: str, threads: int, working: cores.Counter) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent is interrupted, and ends us
     threading.Thread(target=exit_with_parent, daemon=True).start()
     recalled.PROCESS.share(Path(rollouts))
+    cores.PROCESS.share(threads, working)
     jax.config.update("jax_platforms", "cpu")  # as the parent predicts, and a GPU's memory is not for every process
     if cache is not None:
         jax.config.update("jax_compilation_cache_dir", cache)

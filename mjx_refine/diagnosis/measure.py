@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import warnings
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import ndimage
 
+from mjx_refine.diagnosis.gaps import gap_between
 from mjx_refine.observation import Observation
 from mjx_refine.search.features import flow_points, outlines
 from mjx_refine.view.moments import BESIDE, whole_masks
@@ -143,15 +145,16 @@ class Measured:
         return Parts(*(piece.reshape(part.shape) for piece, part in zip(pieces, self.parts, strict=True)))
 
 
-def measure(observation: Observation, columns: tuple[int, ...], near: int = BESIDE) -> Measured:
+def measure(observation: Observation, columns: tuple[int, ...], near: int = 0) -> Measured:
     """Measures a clip.
 
     Args:
       observation: the clip.
       columns: for each object the position of its id among the masks' ids, or -1.
-      near: how near another mask may cut an outline [px].
+      near: how near the border or another mask may cut an outline, at least [px].
     """
     masks = foreground(observation)
+    near = max(near, BESIDE + math.ceil(gap_between(masks)))
     seen = outlines(masks, near=near)
     pixels, flow = flow_points(masks, observation.flow, seen.ids)
     chosen, lost = [max(j, 0) for j in columns], np.array([j < 0 for j in columns])

@@ -112,7 +112,7 @@ class Motion:
       position: centres [m].
       quaternion: w x y z, body to world.
       velocity: of the centres [m/s].
-      spin: angular velocity [rad/s].
+      turning: angular velocity in the bodies' own axes [rad/s].
       batch: sizes, masses, friction.
       known: what effects have worked out at this instant and will ask again.
     """
@@ -122,7 +122,7 @@ class Motion:
     position: Float[np.ndarray, "batch objects 3"]
     quaternion: Float[np.ndarray, "batch objects 4"]
     velocity: Float[np.ndarray, "batch objects 3"]
-    spin: Float[np.ndarray, "batch objects 3"]
+    turning: Float[np.ndarray, "batch objects 3"]
     batch: SceneBatch
     known: dict[Hashable, Any] = dataclasses.field(default_factory=dict, repr=False, compare=False)
 
@@ -132,6 +132,13 @@ class Motion:
         if "axes" not in self.known:
             self.known["axes"] = rotations.matrix(self.quaternion)
         return self.known["axes"]
+
+    @property
+    def spin(self) -> Float[np.ndarray, "batch objects 3"]:
+        """Angular velocity [rad/s]."""
+        if "spin" not in self.known:
+            self.known["spin"] = rotations.turned(self.axes, self.turning)
+        return self.known["spin"]
 
 
 Loads = tuple[Float[np.ndarray, "batch objects 3"], Float[np.ndarray, "batch objects 3"]]
@@ -370,16 +377,13 @@ def glance(gap: Float[np.ndarray, "*batch"], closing: Float[np.ndarray, "*batch"
 
 def rim_speed(motion: Motion) -> Float[np.ndarray, "batch objects"]:
     """How fast spin moves what lies farthest from a body's centre, at most [m/s]."""
-    return np.linalg.norm(motion.spin, axis=-1) * np.linalg.norm(motion.batch.size, axis=-1)
+    return np.linalg.norm(motion.turning, axis=-1) * np.linalg.norm(motion.batch.size, axis=-1)
 
 
 def swing(motion: Motion, target: int) -> Float[np.ndarray, "batch"]:
     """How fast spin moves a body's outline at most [m/s]: a ball's and a rolling cylinder's stays where it is."""
     shape = motion.batch.shapes[target]
     if shape == "sphere":
-        return np.zeros(len(motion.spin))
-    spin = motion.spin[:, target]
-    if shape == "cylinder":
-        axis = motion.axes[:, target, :, 2]
-        spin = spin - (spin * axis).sum(-1, keepdims=True) * axis
-    return np.linalg.norm(spin, axis=-1) * np.linalg.norm(motion.batch.size[:, target], axis=-1)
+        return np.zeros(len(motion.turning))
+    turning = motion.turning[:, target, : 2 if shape == "cylinder" else 3]
+    return np.linalg.norm(turning, axis=-1) * np.linalg.norm(motion.batch.size[:, target], axis=-1)

@@ -37,7 +37,7 @@ class Outlines:
 
 
 def outlines(masks: Int[np.ndarray, "frames height width"], count: int = DIRECTIONS, near: int = BESIDE) -> Outlines:
-    """Measures every mask in every frame; what another mask comes within ``near`` pixels of, it may cut."""
+    """Measures every mask in every frame; what the border or another mask comes within ``near`` pixels of, it may cut."""
     ids = [int(i) for i in np.unique(masks) if i != 0]
     length = len(masks)
     support = np.full((length, len(ids), count), np.nan)
@@ -71,7 +71,7 @@ def _measure(frame: np.ndarray, i: int, normals: np.ndarray, near: int):
     reach = along.max(0) + _beyond(along, normals)
     others = ndimage.maximum_filter(np.where(mask, 0, part), size=2 * near + 1)[rows[extreme], columns[extreme]] > 0
     rows, columns = rows[extreme] + top, columns[extreme] + left
-    cut = (rows < BESIDE) | (columns < BESIDE) | (rows >= height - BESIDE) | (columns >= width - BESIDE) | others
+    cut = (rows < near) | (columns < near) | (rows >= height - near) | (columns >= width - near) | others
     return area, centre, np.where(cut, np.nan, reach)
 
 

@@ -13,6 +13,7 @@ from mujoco import rollout
 from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting
 from mjx_refine.scene import Shape
+from mjx_refine.sim import cores
 from mjx_refine.sim.buckets import diverged_to_nan
 from mjx_refine.sim.carried import carried
 from mjx_refine.sim.model import IDLE, SUBSTEPS, Edited, build_spec, field_arrays, initial_state, model_fields
@@ -21,9 +22,11 @@ from mjx_refine.sim.stepped import stepped_rollout
 # MuJoCo's default handler appends to MUJOCO_LOG.TXT in the working directory. A candidate that diverges is no news.
 mujoco.set_mju_user_warning(lambda _message: None)
 
-STEPS_A_THREAD = 64
-"""Steps, times candidates, that are worth one more thread: to wake it takes 25 to 50 us, a step in the air 2 us and one on the
-floor 20."""
+A_THREAD = 100e-6
+"""Work that is worth one more thread [s]: to wake it takes 25 to 50 us."""
+
+A_STEP = 2e-6
+"""What one step of one candidate takes at least [s]: in the air; one on the floor takes 20 us."""
 
 
 class MujocoSimulator:
@@ -32,7 +35,8 @@ class MujocoSimulator:
     Args:
       shapes: the scene kind.
       fps: frames a second; the time step is 1 / (8 fps).
-      threads: worker threads; all cores by default. The result does not depend on it.
+      threads: worker threads at most, and not more than this process's part of ``cores``; all cores by default. The result
+        does not depend on it.
     """
 
     name = "mujoco"
@@ -49,9 +53,9 @@ class MujocoSimulator:
         self._off_centre: tuple[mujoco.MjModel, list[mujoco.MjData], list[Edited]] | None = None
         self._workers: dict[int, rollout.Rollout] = {}
 
-    def _workers_for(self, steps: int) -> rollout.Rollout:
-        """Threads for so many steps of single candidates; this one alone for few."""
-        worth = min(self.threads, steps // STEPS_A_THREAD)
+    def _workers_for(self, work: float) -> rollout.Rollout:
+        """Threads for what takes one of them so long [s]; this one alone for little."""
+        worth = min(self.threads, cores.PROCESS.mine, int(work / A_THREAD))
         # A power of two, or all: few pools serve all calls.
         threads = 0 if worth < 2 else worth if worth == self.threads else 1 << (worth.bit_length() - 1)
         if threads not in self._workers:
@@ -110,7 +114,7 @@ class MujocoSimulator:
             later = stepped_rollout(self._workers_for, models, data, state, batch, frames, world)
         else:
             steps = (frames - 1) * SUBSTEPS
-            workers = self._workers_for(steps * len(batch))
+            workers = self._workers_for(steps * len(batch) * A_STEP)
             states, _ = workers.rollout(models, data[: workers.nthread or 1], state, nstep=steps)
             later = np.asarray(states)[:, SUBSTEPS - 1 :: SUBSTEPS, 1 : 1 + qpos.shape[1]]
         return np.concatenate([first, later], 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import mujoco
@@ -19,7 +20,7 @@ from mjx_refine.sim.model import SUBSTEPS
 # What diverges is told by its poses.
 @np.errstate(over="ignore", invalid="ignore")
 def stepped_rollout(
-    workers_for: Callable[[int], rollout.Rollout],
+    workers_for: Callable[[float], rollout.Rollout],
     models: list[mujoco.MjModel],
     data: list[mujoco.MjData],
     state: Float[np.ndarray, "batch state"],
@@ -33,7 +34,7 @@ def stepped_rollout(
     every effect says that its loads stay as they are, steps are taken together.
 
     Args:
-      workers_for: threads for so many steps of single candidates.
+      workers_for: threads for what takes one of them so long [s].
       models: one a candidate; the floor's friction is written into them and put back.
       data: one a thread.
       state: full physics state at the first frame.
@@ -48,7 +49,7 @@ def stepped_rollout(
     result = np.empty((count, frames - 1, positions))
     spec = mujoco.mjtState.mjSTATE_XFRC_APPLIED.value
     centre = acting.centre_of_mass(batch)
-    k, last = 0, (frames - 1) * SUBSTEPS
+    k, last, a_step = 0, (frames - 1) * SUBSTEPS, 0.0
     while k < last:
         motion = _motion(state, batch, k * step, step, world)
         idle = acting.idle(batch, motion)
@@ -67,7 +68,7 @@ def stepped_rollout(
             current = wanted
         # Checks of shapes would take as long as a step.
         states, nothing = np.empty((count, steps, state.shape[1])), np.empty((count, steps, 0))
-        workers = workers_for(count * steps)
+        workers, begun = workers_for(count * steps * a_step), time.perf_counter()
         workers.rollout(
             models,
             data[: workers.nthread or 1],
@@ -80,6 +81,7 @@ def stepped_rollout(
             sensordata=nothing,
             skip_checks=True,
         )
+        a_step = (time.perf_counter() - begun) * max(workers.nthread, 1) / (count * steps)
         ends = np.arange(-(-(k + 1) // SUBSTEPS) * SUBSTEPS, k + steps + 1, SUBSTEPS)
         result[:, ends // SUBSTEPS - 1] = states[:, ends - k - 1, 1 : 1 + positions]
         state, k = states[:, -1].copy(), k + steps
@@ -103,7 +105,7 @@ def _applied(told: Loads | None, world: np.ndarray | None, shape: tuple[int, int
 def _about_the_mass(told: Loads, motion: Motion, centre: np.ndarray) -> Loads:
     """Loads about the centres of mass, where MuJoCo applies them, from those about the bodies' centres."""
     force, torque = told
-    return force, torque - rotations.cross(rotations.rotate(motion.quaternion, centre), force)
+    return force, torque - rotations.cross(rotations.turned(motion.axes, centre), force)
 
 
 def _motion(state: np.ndarray, batch: SceneBatch, time: float, step: float, world: np.ndarray | None) -> Motion:
@@ -111,11 +113,8 @@ def _motion(state: np.ndarray, batch: SceneBatch, time: float, step: float, worl
     qpos = state[:, 1 : 1 + 7 * objects].reshape(count, objects, 7)
     qvel = state[:, 1 + 7 * objects : 1 + 13 * objects].reshape(count, objects, 6)
     position, quaternion, velocity = qpos[..., :3], qpos[..., 3:], qvel[..., :3]
-    axes = rotations.matrix(quaternion)
-    spin = rotations.turned(axes, qvel[..., 3:])
     if world is not None:
-        position, velocity, spin = (np.einsum("bij,bnj->bni", world, v) for v in (position, velocity, spin))
+        position, velocity = (np.einsum("bij,bnj->bni", world, v) for v in (position, velocity))
         turn = np.broadcast_to(acting.quaternion_of(world)[:, None], quaternion.shape)
         quaternion = rotations.multiply(turn, quaternion)
-        axes = world[:, None] @ axes
-    return Motion(time, step, position, quaternion, velocity, spin, batch, {"axes": axes})
+    return Motion(time, step, position, quaternion, velocity, qvel[..., 3:], batch)

@@ -183,16 +183,16 @@ def mask_moments(
 ) -> Moments:
     """Moments of observed masks, (frames, ids), float64; NaN where they cannot be the whole silhouette's.
 
-    That is where the mask has fewer than ``least`` pixels, or comes within two of the border or ``near`` of another mask.
+    That is where the mask has fewer than ``least`` pixels, or comes within ``near`` of the border or of another mask.
     """
     shape = (len(masks), len(ids))
     area, centroid, second = np.full(shape, np.nan), np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan)
     for t, frame in enumerate(masks):
         for j, i in enumerate(ids):
             rows, columns = np.nonzero(frame == i)
-            if len(rows) < least or min(rows.min(), columns.min()) < 2:
+            if len(rows) < least or min(rows.min(), columns.min()) < near:
                 continue
-            if rows.max() >= frame.shape[0] - 2 or columns.max() >= frame.shape[1] - 2:
+            if rows.max() >= frame.shape[0] - near or columns.max() >= frame.shape[1] - near:
                 continue
             top, left = max(rows.min() - near, 0), max(columns.min() - near, 0)
             part = frame[top : rows.max() + near + 1, left : columns.max() + near + 1]
