@@ -278,14 +278,15 @@ class ClipFit:
         self.rollouts += len(batch) * frames / self.frames
         return self.simulator.rollout(batch, frames)
 
-    def poses(self, hypothesis: Hypothesis, z: np.ndarray) -> np.ndarray:
-        """Rollouts at the rows of ``z``."""
-        self.rollouts += len(z)
-        return self.simulator.rollout(hypothesis.batch(z), self.frames)
+    def poses(self, hypothesis: Hypothesis, z: np.ndarray, keep: np.ndarray | None = None) -> np.ndarray:
+        """Rollouts at the rows of ``z``; after what is kept, all stands still."""
+        needed = self.frames if keep is None else min(int(np.flatnonzero(keep)[-1]) + 2, self.frames)
+        told = self.rollout(hypothesis.batch(z), needed)
+        return np.concatenate([told, np.repeat(told[:, -1:], self.frames - needed, 1)], 1)
 
     def residuals(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE):
         """(residuals (B, R), half their sum of squares with the prior (B,))."""
-        prediction = self.predictor(self.poses(hypothesis, z), hypothesis.batch(z))
+        prediction = self.predictor(self.poses(hypothesis, z, keep), hypothesis.batch(z))
         white = self.whitened(self.distances(prediction), keep, scale, hypothesis)
         cost = 0.5 * (white**2).sum(1) + 0.5 * (prior(hypothesis, z)[0] ** 2).sum(1)
         return white, np.where(prediction.bad, np.inf, cost)
@@ -293,7 +294,7 @@ class ClipFit:
     def jacobian(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE, size=STEPS[0]):
         """d residuals / d z (R, D) by differences towards the inside of the bounds."""
         step = np.where(z + size > hypothesis.bounds[1], -size, size)
-        told = beside(hypothesis, z, step, functools.partial(self.poses, hypothesis))
+        told = beside(hypothesis, z, step, functools.partial(self.poses, hypothesis, keep=keep))
         prediction = self.predictor(told.poses, hypothesis.batch(told.points))
         white = self.rigid(self.distances(prediction), keep, scale)
         change = np.where(prediction.bad[told.row, None], 0.0, white[told.row] - white[0])
@@ -313,8 +314,7 @@ class ClipFit:
         rival: float = np.inf,
         attempts: int | None = None,
     ) -> Fit:
-        """Levenberg-Marquardt from ``z``, given up where it stays far behind ``rival``, another hypothesis' cost; interrupted
-        after so many ``attempts``."""
+        """Levenberg-Marquardt from ``z``; given up far behind ``rival``, another's cost; interrupted after ``attempts``."""
         return self._descended(hypothesis, np.clip(z, *hypothesis.bounds), iterations, keep, scale, rival, attempts)
 
     @remembered

@@ -20,6 +20,7 @@ from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import beginning, chosen_of
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
+from mjx_refine.diagnosis.staged import staged
 from mjx_refine.effects.kind import FitView
 
 WARM, COOLER = 10.0, 3.0
@@ -32,6 +33,10 @@ GROUND, FIRST, FURTHER, LAST = 10, 8, 6, 9
 FAMILIES, GO_ON, END, ROAMING = 10, 6, 4, 3
 """Effects and targets that are fitted with the most noise, those that go on with less, those that go on to the end, and
 those that look around their ends before."""
+
+JAGGED = 0.8
+"""Part of what the base model costs when it is fitted at once that it costs where it is fitted by stages, from which on effects
+are fitted by stages too."""
 
 Shown = Callable[[Fit], FitView]
 Told = Callable[[str], None]
@@ -65,11 +70,16 @@ def annealed(
     """
     plain = dataclasses.replace(base.hypothesis, slack=None)
     with tempered(clip, WARM):
-        ground = clip.roam(clip.fit(plain, np.zeros(plain.dimension), GROUND), seed, ROAMED_AGAIN)
-        leads = chosen_of(Screen(clip, ground, shown(ground)).leads(names), FAMILIES, 1)
-        rows = [(ground, lead) for lead in leads]
+        at_once, by_stages = clip.crew.each(clip, _ground, [(plain, False), (plain, True)])
+        jagged = by_stages.cost < JAGGED * at_once.cost
+        ground = by_stages if jagged else clip.roam(at_once, seed, ROAMED_AGAIN)
+        ahead = Screen(clip, ground, shown(ground))
+        leads = chosen_of(ahead.leads(names), FAMILIES, 1)
+        if jagged:
+            leads += [lead for lead in ahead.away(names) if lead.target < 0]
+        rows = [(ground, lead, jagged) for lead in leads]
         fits = clip.crew.each(clip, _first, rows, told, [lines(lead) for lead in leads])
-    found = _cheapest(list(zip(leads, fits, strict=True)), GO_ON)
+    found = _of_their_families(list(zip(leads, fits, strict=True)))[:GO_ON]
     with tempered(clip, COOLER):
         ground, *fits = clip.crew.each(clip, _further, [(ground,), *((fit,) for _, fit in found)])
         found = _cheapest([(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)], END)
@@ -126,16 +136,34 @@ def _cheapest(found: list[tuple[Lead, Fit]], count: int) -> list[tuple[Lead, Fit
     return sorted(found, key=lambda one: one[1].cost)[:count]
 
 
+def _of_their_families(found: list[tuple[Lead, Fit]]) -> list[tuple[Lead, Fit]]:
+    """The cheapest of every effect and target."""
+    best: dict[tuple[str, int], tuple[Lead, Fit]] = {}
+    for lead, fit in _cheapest(found, len(found)):
+        best.setdefault((lead.name, lead.target), (lead, fit))
+    return list(best.values())
+
+
 def _plain(fit: Fit) -> Fit:
     """The fit without what its contacts may err by."""
     terms = tuple(dataclasses.replace(t, excused=None) for t in fit.hypothesis.terms)
     return dataclasses.replace(fit, hypothesis=dataclasses.replace(fit.hypothesis, slack=None, terms=terms))
 
 
-def _first(clip: ClipFit, ground: Fit, lead: Lead) -> Fit:
+def _ground(clip: ClipFit, plain: Hypothesis, by_stages: bool) -> Fit:
+    start = np.zeros(plain.dimension)
+    return staged(clip, plain, start) if by_stages else clip.fit(plain, start, GROUND)
+
+
+def _first(clip: ClipFit, ground: Fit, lead: Lead, by_stages: bool = False) -> Fit:
+    """An effect's fit from where it was seen or, where that is cheaper, by stages from the given scene."""
     one = lead.term(clip.frames)
-    hypothesis = ground.hypothesis.added(one)
-    return clip.fit(hypothesis, beginning(clip, hypothesis, ground, lead, lead.z(one)), FIRST, rival=ground.cost)
+    hypothesis, z = ground.hypothesis.added(one), lead.z(one)
+    fit = clip.fit(hypothesis, beginning(clip, hypothesis, ground, lead, z), FIRST, rival=ground.cost)
+    if not by_stages:
+        return fit
+    other = staged(clip, hypothesis, np.concatenate([np.zeros(len(ground.z)), z]))
+    return min(fit, other, key=lambda one: one.cost)
 
 
 def _further(clip: ClipFit, fit: Fit) -> Fit:
