@@ -19,7 +19,7 @@ from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, jagged, settled
 from mjx_refine.diagnosis.pace import STEPS, Standing, descended
 from mjx_refine.diagnosis.predict import Prediction, Predictor
-from mjx_refine.diagnosis.roam import GENERATIONS, ROAMED, Strategy
+from mjx_refine.diagnosis.roam import ROAMED, Strategy, looked_around
 from mjx_refine.diagnosis.settled import Loose, Settled
 from mjx_refine.diagnosis.slack import PART, Contacts, Impact, Slack, Slacks, contacts, kicked
 from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
@@ -364,18 +364,11 @@ class ClipFit:
 
     @remembered
     def roam(self, fit: Fit, seed: int, widths: tuple[float, ...] = ROAMED) -> Fit:
-        """Least squares again from where an evolution strategy ends that begins at a fit, in its posterior's coordinates;
-        ``widths``: of the first generation in each round [posterior standard deviations]."""
+        """Least squares from where an evolution strategy ends that begins at a fit, in its posterior's coordinates; ``widths``:
+        of each round's first generation [posterior standard deviations]."""
         for width in widths:
-            factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
-            best, point = fit.cost, fit.z
             strategy = Strategy(len(fit.z), width, seed)
-            for _ in range(GENERATIONS):
-                points = np.clip(fit.z + strategy.ask() @ factor, *fit.hypothesis.bounds)
-                costs = self.residuals(fit.hypothesis, points)[1]
-                if np.min(costs) < best:
-                    best, point = float(np.min(costs)), points[int(np.argmin(costs))]
-                strategy.tell(costs)
+            best, point = looked_around(fit, strategy, functools.partial(self.residuals, fit.hypothesis))
             if best < fit.cost:
                 trial = self.fit(fit.hypothesis, point, 8)
                 fit = trial if trial.cost < fit.cost else fit

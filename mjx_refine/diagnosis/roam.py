@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from jaxtyping import Float
+
+from mjx_refine.diagnosis.fitted import Fit
 
 OFFSPRING = 40
 """Of a generation."""
 
-GENERATIONS = 16
-"""Of a round."""
+GENERATIONS, FRUITLESS = 16, 8
+"""Of a round, and of one that finds nothing better: what those after it found in a clip without jags was worth 1 to 3."""
 
 ROAMED, ROAMED_AGAIN = (1.0, 4.0), (2.0,)
 """Widths of the first generation in each round, of the base model's fit and of effects' [posterior standard deviations]."""
@@ -52,3 +56,26 @@ class Strategy:
         self._path = (1 - self._rate) * self._path + self._kick * step
         grown = float(np.linalg.norm(self._path)) / self._length - 1
         self._width *= float(np.exp(min(self._rate / self._damping * grown, 1.0)))
+
+
+def looked_around(
+    fit: Fit, strategy: Strategy, residuals: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> tuple[float, Float[np.ndarray, "dimension"]]:
+    """(cost, point) of the cheapest point that the strategy finds around a fit; the fit's own where none is cheaper.
+
+    Args:
+      fit: where it begins; its posterior's coordinates are the strategy's.
+      strategy: that has not begun.
+      residuals: of points, one a row, with what they cost.
+    """
+    factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
+    best, point = fit.cost, fit.z
+    for generation in range(GENERATIONS):
+        if generation == FRUITLESS and best == fit.cost:
+            break
+        points = np.clip(fit.z + strategy.ask() @ factor, *fit.hypothesis.bounds)
+        costs = residuals(points)[1]
+        if np.min(costs) < best:
+            best, point = float(np.min(costs)), points[int(np.argmin(costs))]
+        strategy.tell(costs)
+    return best, point

@@ -3,7 +3,7 @@
 With the noise as it is, the base model's ordinary numbers bend by ten prior widths and more to imitate an effect, since each
 noise width that they gain is worth it, and least squares that begin there, or at a given scene that is far off, seldom find the
 way back. With ten times the noise they are held near the given scene, residuals hold the effect itself, and a linear look tells
-which it is. From there on the noise falls, and every fit follows.
+which it is. From there on the noise falls, and every fit follows. Where contacts leave jags, fits begin with the first frames.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ FAMILIES, GO_ON, END, ROAMING = 10, 6, 4, 3
 those that look around their ends before."""
 
 JAGGED = 0.8
-"""Part of what the base model costs when it is fitted at once that it costs where it is fitted by stages, from which on effects
-are fitted by stages too."""
+"""Effects are fitted by stages, too, where the base model then costs less than this part of what it costs when it is fitted at
+once."""
 
 Shown = Callable[[Fit], FitView]
 Told = Callable[[str], None]
@@ -72,7 +72,7 @@ def annealed(
     with tempered(clip, WARM):
         at_once, by_stages = clip.crew.each(clip, _ground, [(plain, False), (plain, True)])
         jagged = by_stages.cost < JAGGED * at_once.cost
-        ground = by_stages if jagged else clip.roam(at_once, seed, ROAMED_AGAIN)
+        ground = min(by_stages, at_once, key=lambda fit: fit.cost)
         ahead = Screen(clip, ground, shown(ground))
         leads = chosen_of(ahead.leads(names), FAMILIES, 1)
         if jagged:
