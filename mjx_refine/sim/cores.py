@@ -15,6 +15,7 @@ class Counter(Protocol):
 
     def get_lock(self) -> contextlib.AbstractContextManager[object]:
         """Held while the value is changed."""
+        ...
 
 
 class Cores:
