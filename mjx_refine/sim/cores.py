@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator
 from typing import Protocol
+
+from mjx_refine.children import cores
 
 
 class Counter(Protocol):
@@ -22,7 +23,7 @@ class Cores:
     """So many cores, divided among the processes that are at work just now."""
 
     def __init__(self) -> None:
-        self._count = os.cpu_count() or 1
+        self._count = cores()
         self._working: Counter | None = None
 
     def share(self, count: int, working: Counter) -> None:
@@ -31,7 +32,7 @@ class Cores:
 
     def release(self) -> None:
         """From now on has all cores again."""
-        self._count, self._working = os.cpu_count() or 1, None
+        self._count, self._working = cores(), None
 
     @property
     def mine(self) -> int:

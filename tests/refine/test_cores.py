@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import multiprocessing
-import os
 
 import numpy as np
 import pytest
 from own_clip import FLIGHT
 
+from mjx_refine.children import cores as available
 from mjx_refine.effects.acting import batch_with_effects
 from mjx_refine.scene import Effect
 from mjx_refine.sim import cores
@@ -18,9 +18,9 @@ from mjx_refine.sim.c import MujocoSimulator
 
 def test_all_cores_are_mine_until_they_are_shared():
     own = cores.Cores()
-    assert own.mine == os.cpu_count()
+    assert own.mine == available()
     with own.at_work():
-        assert own.mine == os.cpu_count()
+        assert own.mine == available()
 
 
 def test_those_at_work_divide_the_cores():
@@ -36,7 +36,7 @@ def test_those_at_work_divide_the_cores():
         assert one.mine == 7
     assert working.value == 0
     one.release()
-    assert one.mine == os.cpu_count()
+    assert one.mine == available()
 
 
 def test_who_fails_is_at_work_no_more():
