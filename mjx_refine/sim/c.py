@@ -17,16 +17,13 @@ from mjx_refine.sim import cores
 from mjx_refine.sim.buckets import diverged_to_nan
 from mjx_refine.sim.carried import carried
 from mjx_refine.sim.model import IDLE, SUBSTEPS, Edited, build_spec, field_arrays, initial_state, model_fields
-from mjx_refine.sim.stepped import stepped_rollout
+from mjx_refine.sim.stepped import A_STEP, stepped_rollout
 
 # MuJoCo's default handler appends to MUJOCO_LOG.TXT in the working directory. A candidate that diverges is no news.
 mujoco.set_mju_user_warning(lambda _message: None)
 
 A_THREAD = 100e-6
 """Work that is worth one more thread [s]: to wake it takes 25 to 50 us."""
-
-A_STEP = 2e-6
-"""What one step of one candidate takes at least [s]: in the air; one on the floor takes 20 us."""
 
 
 class MujocoSimulator:
