@@ -116,7 +116,7 @@ def lead_of(fit: Weighed, base: Weighed) -> float:
 def in_order(clip: ClipFit, found: Sequence[Candidate]) -> tuple[Candidate, ...]:
     """The candidates by their leads as ``lead_of`` tells them: no obstacles that are leant on; pushes that are an impact's, and
     those that an obstacle explains nearly as well, with less."""
-    found = [one for one in found if not _leans(clip, one.fit)]
+    found = [one for one in found if not leans_on(clip, one.fit)]
 
     def told(one: Candidate) -> Candidate:
         unit = max(clip.misfit(one.fit), LEAST_UNIT)
@@ -128,7 +128,7 @@ def in_order(clip: ClipFit, found: Sequence[Candidate]) -> tuple[Candidate, ...]
     return tuple(sorted((told(one) for one in found), key=lambda one: -one.lead))
 
 
-def _leans(clip: ClipFit, fit: Fit) -> bool:
+def leans_on(clip: ClipFit, fit: Fit) -> bool:
     """Whether an object is at an obstacle most of the time."""
     walls = [k for k, t in enumerate(fit.hypothesis.terms) if t.name == "hidden_obstacle"]
     if not walls:

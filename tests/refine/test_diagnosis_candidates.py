@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from test_diagnosis import FLIGHT
 
-from mjx_refine.diagnosis import candidates, pairs
+from mjx_refine.diagnosis import candidates, pairs, search
 from mjx_refine.diagnosis.base import base_space
 from mjx_refine.diagnosis.candidates import AGAINST, AT_IMPACT, DOUBT, LEAST_UNIT, Candidate, in_order, lead_of
 from mjx_refine.diagnosis.fitted import Fit
@@ -27,7 +27,7 @@ PRICE = AGAINST * MISFIT
 def _short_hits(request, monkeypatch):
     """Obstacles are hit and left, but where a test is about that."""
     if "leant" not in request.node.name:
-        monkeypatch.setattr(candidates, "_leans", lambda clip, fit: False)
+        monkeypatch.setattr(candidates, "leans_on", lambda clip, fit: False)
     if "impact" not in request.node.name:
         monkeypatch.setattr(candidates, "_bounces", lambda clip, fit: False)
 
@@ -162,3 +162,24 @@ def test_twos_with_a_push_are_tried_with_an_obstacle_and_with_a_patch_in_its_pla
     everything = {"hidden_obstacle": [300.0, 200.0], "friction_patch": [300.0]}
     assert asked == {name: rows for name, rows in everything.items() if name != without}
     assert [one.lead for one in found] == ([] if without == "hidden_obstacle" else [201.0])
+
+
+@pytest.mark.parametrize(
+    ("kept", "found", "stays"),
+    [
+        (None, (50.0, True), False),
+        ((50.0, False), (60.0, False), False),
+        ((50.0, False), (40.0, False), True),
+        ((50.0, False), (60.0, True), True),
+        ((50.0, True), (40.0, False), False),
+        ((50.0, True), (60.0, True), False),
+    ],
+)
+def test_an_obstacle_that_is_leant_on_takes_no_place_of_one_that_is_hit(monkeypatch, kept, found, stays):
+    monkeypatch.setattr(search, "leans_on", lambda _clip, fit: fit.leans)
+    key, (evidence, leans) = ("hidden_obstacle", 0), found
+    new: Any = SimpleNamespace(evidence=evidence, leans=leans)
+    old: Any = None if kept is None else SimpleNamespace(evidence=kept[0], leans=kept[1])
+    fitted: dict = {} if old is None else {key: (old, 1.0)}
+    search._keep(cast(Any, None), fitted, key, new, 2.0)
+    assert fitted[key] == ((old, 1.0) if stays else (new, 2.0))

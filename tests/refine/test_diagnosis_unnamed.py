@@ -18,7 +18,7 @@ from mjx_refine.diagnosis.candidates import Freed
 from mjx_refine.diagnosis.diagnose import TO_THE_NOISE, verdict_of
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.signs import MOSTLY, signs
-from mjx_refine.diagnosis.verdict import NAMED, UNNAMED, UNNAMED_ON_THE_FLOOR, Answer, answer
+from mjx_refine.diagnosis.verdict import UNNAMED, UNNAMED_ALONE, UNNAMED_ON_THE_FLOOR, Answer, answer
 from mjx_refine.effects import acting_kind, catalogue, kind_of
 from mjx_refine.effects.free_force import KNOTS
 from mjx_refine.errors import InputError
@@ -72,9 +72,9 @@ def test_no_scene_and_no_call_may_name_it():
         ({"unnamed": UNNAMED + 1}, "single", False),
         ({"unnamed": UNNAMED_ON_THE_FLOOR + 1}, "unknown", True),
         ({"unnamed": UNNAMED + 1, "aloft": 1.0, "pair": 200.0}, "unknown", True),
-        ({"lead": 20.0, "unnamed": NAMED + 1, "aloft": 1.0}, "unknown", True),
-        ({"lead": 20.0, "unnamed": NAMED - 1, "aloft": 1.0}, "none", False),
-        ({"lead": 20.0, "unnamed": NAMED + 1}, "none", False),
+        ({"lead": 20.0, "unnamed": UNNAMED_ALONE + 1, "aloft": 1.0}, "unknown", True),
+        ({"lead": 20.0, "unnamed": UNNAMED_ALONE - 1, "aloft": 1.0}, "none", False),
+        ({"lead": 20.0, "unnamed": UNNAMED_ALONE + 1}, "none", False),
         ({"closed": 0.05, "unnamed": UNNAMED + 1, "aloft": 1.0}, "unknown", True),
         ({"closed": 0.05, "unnamed": UNNAMED - 1, "aloft": 1.0}, "unknown", False),
     ],
