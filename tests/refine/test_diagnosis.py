@@ -214,7 +214,7 @@ def changed(changes):
         ({"structure_after": 9.0, "unmistakable": 1.0}, "single"),
         ({"structure_first": 9.0, "unmistakable": 1.0}, "single"),
         ({"closed": 0.2, "unmistakable": 1.0}, "single"),
-        ({"closed": 0.05, "unmistakable": 1.0}, "unknown"),
+        ({"closed": 0.05, "unmistakable": 1.0, "before": 1.9}, "unknown"),
         ({"closed": 0.05, "unmistakable": 1.0, "before": 2.1}, "single"),
         ({"closed": 0.05, "before": 2.1}, "unknown"),
         ({"closed": 0.05, "unmistakable": 1.0, "before": 2.1, "structure_after": 1.4}, "unknown"),
