@@ -44,7 +44,7 @@ def background_energy(clip: ClipFit, fit: Fit) -> Float[np.ndarray, "frames"]:
     together. What flow invents beside a moving object, in shadows and where nothing has texture, is not.
     """
     background = clip.measured.split(fit.residual).background
-    seen = np.isfinite(clip.measured.background).all(-1)
+    seen = np.atleast_1d(np.isfinite(clip.measured.background).all(-1))
     shared = [_shared(row[ok], clip.measured.places[ok]) for row, ok in zip(background, seen, strict=True)]
     return np.append(np.array(shared) / (2 * BACKGROUND_COUNT), 0.0)
 

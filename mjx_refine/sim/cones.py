@@ -57,9 +57,9 @@ def _bodies(jacobian: wp.array3d(dtype=float), world: int, row: int, count: int)
 @wp.func
 def _column(bodies: wp.vec2i, k: int) -> int:
     """The k-th of the bodies' twelve degrees of freedom; -1 where there is no second body."""
-    body = bodies[0]
+    body = bodies[0]  # pyright: ignore[reportIndexIssue]
     if k >= 6:
-        body = bodies[1]
+        body = bodies[1]  # pyright: ignore[reportIndexIssue]
     return wp.where(body < 0, -1, 6 * body + k % 6)
 
 
@@ -135,7 +135,7 @@ def cone_curvature(
     hessian: wp.array3d(dtype=float),
 ):
     """Arguments as of ``solver._update_gradient_JTCJ_dense``; threads take contacts' pairs in turns."""
-    block, element = wp.tid()
+    block, element = wp.tid()  # pyright: ignore
     width = tri_row.shape[0]
     bodies = (tri_row[width - 1] + 1) // 6
     for item in range(block * width + element, wp.min(count[0], most) * _PAIRS, blocks * width):

@@ -159,7 +159,7 @@ def _arrays(group: Any) -> Iterator[wp.array]:
 
     def within(one: Any) -> Iterator[wp.array]:
         if isinstance(one, wp.array):
-            if one.size and one.ptr not in seen:
+            if one.size and one.ptr is not None and one.ptr not in seen:
                 seen.add(one.ptr)
                 yield one
         elif dataclasses.is_dataclass(one):
@@ -179,5 +179,5 @@ def _next(frame: wp.array(dtype=int)):
 
 @wp.kernel
 def _keep(frame: wp.array(dtype=int), qpos: wp.array2d(dtype=float), poses: wp.array3d(dtype=float)):
-    world, k = wp.tid()
+    world, k = wp.tid()  # pyright: ignore
     poses[world, frame[0], k] = qpos[world, k]
