@@ -52,13 +52,13 @@ the best as those that are left after their first steps."""
 SLIGHT, ANYWAY = 5.0, 3
 """Gains that bring nothing new: fits that after their first steps cost less than the base model by no more than this are left as
 they are, but for the best ones, whose ordinary numbers may serve the base model (of 81 such in ten clips of seed 17 none ended
-above a lead of 24, and what is named leads by 30 at least); base models better by no more than this do not give theirs to
-effects once more, nor do effects that cost less than the base model by no more, since it cannot gain more by them."""
+above a lead of 24, and what is named leads by 30 at least); and effects that got better by no more than this, or cost less than
+the base model by no more, are no reason to exchange numbers anew, since the base model cannot gain more by them."""
 
 ANEW = 20.0
-"""How much better a base model must have become for effects to be looked for anew: of seven such clips,
-most of seed 25 of the withheld exams, those better by 11, 16 and 26 led to nothing, as did those by 45 and 57, and those by 32
-and 53 to what leads then."""
+"""How much better a base model must have become for effects to be looked for anew: of seven such clips, most of seed 25 of the
+withheld exams, those better by 11, 16 and 26 led to nothing, as did those by 45 and 57, and those by 32 and 53 to what leads
+then."""
 
 CLEAR, KEPT = 40.0, 6
 """Lead of an effect from which the noise is taken anew from what it leaves, and how many effects are fitted again with that."""
