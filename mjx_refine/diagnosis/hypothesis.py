@@ -105,6 +105,12 @@ class Hypothesis:
         """Which coordinates are the base model's."""
         return np.arange(self.dimension) < self.space.dimension
 
+    @property
+    def rigid(self) -> Hypothesis:
+        """The hypothesis with the clip's own contacts, and impacts with unseen things that do not err."""
+        terms = tuple(dataclasses.replace(t, excused=None) for t in self.terms)
+        return dataclasses.replace(self, slack=None, terms=terms)
+
     @functools.cached_property
     def excused(self) -> Float[np.ndarray, "residuals columns"] | None:
         """What the terms' impacts may err by, or None."""

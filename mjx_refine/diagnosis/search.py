@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mjx_refine.diagnosis.base import base_space, stored_base, with_grips
-from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_of, leans_on
+from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared, in_order, lead_of, leans_on
 from mjx_refine.diagnosis.exchange import Fitted, Key, alone, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
@@ -18,6 +18,7 @@ from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.pairs import annealed_pairs, pairs_of
 from mjx_refine.diagnosis.patches import patches_from_pushes
 from mjx_refine.diagnosis.roam import ROAMED_AGAIN
+from mjx_refine.diagnosis.scattered import WORTH, fairly, scattered
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.diagnosis.tempered import Shown, Told, annealed
@@ -129,7 +130,13 @@ def compare(
         told("noise, once more")
         base, singles, twos, impacts = _again(clip, base, singles, twos, seed)
     pairs = pairs_of(clip, base, singles, twos, names, shown, seed, told)
-    return Compared(base, _as_found_together(clip, base, singles, pairs), pairs, impacts)
+    singles = _as_found_together(clip, base, singles, pairs)
+    if video and singles and singles[0].lead > WORTH * max(clip.misfit(singles[0].fit), LEAST_UNIT):
+        told("from other places")
+        bound = singles[0].lead - max(CLOSE, SOME_OF_IT * singles[0].lead)
+        base, singles, pairs = fairly(clip, base, singles, pairs, bound, seed)
+        singles = _as_found_together(clip, base, singles, pairs)
+    return Compared(base, singles, pairs, impacts)
 
 
 def _singles(
@@ -173,6 +180,10 @@ def _singles(
     least = max(HOPELESS, most - max(CLOSE, SOME_OF_IT * most))
     first = [key for key in first if lead_of(fitted[key][0], base) >= least]
     gained = False
+    if video:
+        told("base model from other places")
+        (better,) = scattered(clip, [base], [fitted[key][0] for key in first], base.hypothesis.dimension, seed)
+        gained, base = better.evidence > base.evidence + ANEW, better
     for key, fit in zip(first, clip.crew.each(clip, _roamed, [(fitted[key][0], seed) for key in first]), strict=True):
         better = fit.evidence > fitted[key][0].evidence + SLIGHT
         gained = gained or (better and fit.cost < base.cost - SLIGHT)

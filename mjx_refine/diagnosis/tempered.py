@@ -113,7 +113,9 @@ def beside_tempered(
       seconds: how many second effects are fitted beside each.
     """
     with tempered(clip, WARM):
-        grounds = clip.crew.each(clip, _further, [(_plain(fit),) for fit in firsts])
+        grounds = clip.crew.each(
+            clip, _further, [(dataclasses.replace(fit, hypothesis=fit.hypothesis.rigid),) for fit in firsts]
+        )
     with tempered(clip, COOLER):
         grounds = clip.crew.each(clip, _further, [(ground,) for ground in grounds]) + unbent
         rows: list[tuple[Fit, Lead]] = []
@@ -142,12 +144,6 @@ def _of_their_families(found: list[tuple[Lead, Fit]]) -> list[tuple[Lead, Fit]]:
     for lead, fit in _cheapest(found, len(found)):
         best.setdefault((lead.name, lead.target), (lead, fit))
     return list(best.values())
-
-
-def _plain(fit: Fit) -> Fit:
-    """The fit without what its contacts may err by."""
-    terms = tuple(dataclasses.replace(t, excused=None) for t in fit.hypothesis.terms)
-    return dataclasses.replace(fit, hypothesis=dataclasses.replace(fit.hypothesis, slack=None, terms=terms))
 
 
 def _ground(clip: ClipFit, plain: Hypothesis, by_stages: bool) -> Fit:
