@@ -140,6 +140,11 @@ class Hypothesis:
         return np.array(told + [t.target for t in self.terms for _ in range(int(t.free.sum()))], int)
 
     @property
+    def strikes(self) -> bool:
+        """Whether an effect makes impacts."""
+        return any(t.kind.strikes for t in self.terms)
+
+    @property
     def couples(self) -> bool:
         """Whether an effect acts on one object by another's motion."""
         return any(t.kind.couples for t in self.terms)

@@ -50,6 +50,11 @@ def knocked(clip: ClipFit, fit: Fit, rival: float = np.inf) -> Fit:
     return fit
 
 
+def to_the_end(clip: ClipFit, fit: Fit, iterations: int, rival: float) -> Fit:
+    """A fit that was interrupted, at its end, its impacts with unseen things as they may err."""
+    return knocked(clip, fit if fit.ended else clip.gone_on(fit, iterations, rival), rival)
+
+
 def excuses(clip: ClipFit, fit: Fit, k: int) -> Float[np.ndarray, "residuals columns"] | None:
     """What the first impact of term ``k`` may err by, one standard deviation a column; None where there is none."""
     hypothesis, z, fps = fit.hypothesis, fit.z[None], clip.simulator.fps

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from mjx_refine.diagnosis.candidates import Candidate, in_order, lead_of
 from mjx_refine.diagnosis.exchange import at_least_nothing, begun_again
 from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.knock import knocked
-from mjx_refine.diagnosis.tempered import COOLER, WARM, tempered
+from mjx_refine.diagnosis.knock import to_the_end
+from mjx_refine.diagnosis.tempered import COOLER, WARM, cooled, tempered
 
 AROUND: tuple[tuple[float, tuple[float, ...]], ...] = ((2.0, (COOLER,)), (2.0, (WARM, COOLER)), (5.0, (COOLER,)))
 """Draws around a fit: how far [posterior standard deviations], and with which multiples of the noise fits begin there. Of 27
@@ -60,7 +60,7 @@ def scattered(
         mine = sorted((i for i, owner in enumerate(owners) if owner == k), key=lambda i: looks[i].cost)
         near += mine[:GO_ON]
     best = list(fits)
-    ended = clip.crew.each(clip, _ended, [(looks[i], fits[owners[i]].cost) for i in near])
+    ended = clip.crew.each(clip, to_the_end, [(looks[i], REST, fits[owners[i]].cost) for i in near])
     for i, fit in zip(near, ended, strict=True):
         k = owners[i]
         best[k] = fit if fit.evidence > best[k].evidence else best[k]
@@ -124,16 +124,10 @@ def _draws(
 
 def _look(clip: ClipFit, fit: Fit, z: Float[np.ndarray, "dimension"], warm: tuple[float, ...]) -> Fit:
     """A fit after its first steps from ``z``."""
-    plain = fit.hypothesis.rigid
+    there = dataclasses.replace(fit, hypothesis=fit.hypothesis.rigid, z=z)
     for factor in warm:
         with tempered(clip, factor):
-            z = clip.fit(plain, z, WARMING).z
-    there = clip.at(plain, z)
-    own = dataclasses.replace(plain, slack=clip.slack_along(there))
+            there = clip.fit(there.hypothesis, there.z, WARMING)
     # What strikes may not err yet.
-    rival = np.inf if any(t.kind.strikes for t in fit.hypothesis.terms) else fit.cost
-    return clip.fit(own, z, LOOK + REST, rival=rival, attempts=LOOK)
-
-
-def _ended(clip: ClipFit, fit: Fit, rival: float) -> Fit:
-    return knocked(clip, fit if fit.ended else clip.gone_on(fit, REST, rival), rival)
+    rival = np.inf if fit.hypothesis.strikes else fit.cost
+    return clip.fit(cooled(clip, there), there.z, LOOK + REST, rival=rival, attempts=LOOK)

@@ -12,7 +12,7 @@ from mjx_refine.diagnosis.base import base_space, stored_base, with_grips
 from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared, in_order, lead_of, leans_on
 from mjx_refine.diagnosis.exchange import Fitted, Key, alone, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
-from mjx_refine.diagnosis.knock import knocked
+from mjx_refine.diagnosis.knock import knocked, to_the_end
 from mjx_refine.diagnosis.leads import FIRST, FORGIVING, begun, chosen_of
 from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.pairs import annealed_pairs, pairs_of
@@ -182,8 +182,8 @@ def _singles(
     gained = False
     if video:
         told("base model from other places")
-        (better,) = scattered(clip, [base], [fitted[key][0] for key in first], base.hypothesis.dimension, seed)
-        gained, base = better.evidence > base.evidence + ANEW, better
+        (other,) = scattered(clip, [base], [fitted[key][0] for key in first], base.hypothesis.dimension, seed)
+        gained, base = other.evidence > base.evidence + ANEW, other
     for key, fit in zip(first, clip.crew.each(clip, _roamed, [(fitted[key][0], seed) for key in first]), strict=True):
         better = fit.evidence > fitted[key][0].evidence + SLIGHT
         gained = gained or (better and fit.cost < base.cost - SLIGHT)
@@ -269,7 +269,7 @@ def _keep_leads(clip: ClipFit, base: Fit, fitted: Fitted, rows: list[Row], told:
     least = min([base.cost, *(fit.cost for fit, _ in fitted.values()), *(fit.cost for fit in fits)])
     bound = least + max(CLOSE, SOME_OF_IT * (base.cost - least))
     near = _near(fits, base.cost, bound)
-    for k, fit in zip(near, clip.crew.each(clip, _ended, [(fits[k], base.cost) for k in near]), strict=True):
+    for k, fit in zip(near, clip.crew.each(clip, to_the_end, [(fits[k], REST, base.cost) for k in near]), strict=True):
         fits[k] = fit
     for (_, lead, _), fit in zip(rows, fits, strict=True):
         _keep(clip, fitted, (lead.name, lead.target), fit, lead.gain)
@@ -281,12 +281,9 @@ def _near(fits: list[Fit], nothing: float, bound: float) -> list[int]:
     return [
         k
         for k, fit in enumerate(fits)
-        if fit.cost < (MAY_ERR * bound if _strikes(fit) else bound if k in best else min(bound, nothing - SLIGHT))
+        if fit.cost
+        < (MAY_ERR * bound if fit.hypothesis.strikes else bound if k in best else min(bound, nothing - SLIGHT))
     ]
-
-
-def _strikes(fit: Fit) -> bool:
-    return any(t.kind.strikes for t in fit.hypothesis.terms)
 
 
 def _begun(clip: ClipFit, here: Fit, lead: Lead, scale: float, rival: float) -> Fit:
@@ -299,11 +296,6 @@ def _begun(clip: ClipFit, here: Fit, lead: Lead, scale: float, rival: float) -> 
             hypothesis, np.concatenate([here.z, 0 * lead.z(hypothesis.terms[-1])]), 9, rival=rival, attempts=LOOK
         )
     return fit
-
-
-def _ended(clip: ClipFit, fit: Fit, rival: float) -> Fit:
-    """The fit at its end, its impacts with unseen things as they may err."""
-    return knocked(clip, fit if fit.ended else clip.gone_on(fit, REST, rival), rival)
 
 
 def _in_place_of_pushes(
