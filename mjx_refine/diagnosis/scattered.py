@@ -35,7 +35,7 @@ on, and for how many iterations."""
 
 
 def scattered(
-    clip: ClipFit, fits: Sequence[Fit], sources: Sequence[Fit], count: int, seed: int, rounds: int = 1
+    clip: ClipFit, fits: Sequence[Fit], sources: Sequence[Fit], count: int, seed: int, drawn: bool = True
 ) -> list[Fit]:
     """The fits, or better ones of the same hypotheses from other places.
 
@@ -45,13 +45,13 @@ def scattered(
       sources: other hypotheses' fits, whose ordinary numbers are tried as well.
       count: how many numbers are ordinary.
       seed: of the draws.
-      rounds: how often draws of every kind are made.
+      drawn: whether starts are drawn as well.
     """
     rows: list[tuple[Fit, np.ndarray, tuple[float, ...]]] = []
     owners: list[int] = []
     for k, fit in enumerate(fits):
         generator = np.random.default_rng([seed, k])
-        starts = _others(fit, sources, count) + _draws(fit, count, generator, rounds)
+        starts = _others(fit, sources, count) + (_draws(fit, count, generator) if drawn else [])
         rows += [(fit, np.clip(z, *fit.hypothesis.bounds), warm) for z, warm in starts]
         owners += [k] * len(starts)
     looks = clip.crew.each(clip, _look, rows)
@@ -109,16 +109,12 @@ def _others(fit: Fit, sources: Sequence[Fit], count: int) -> list[tuple[np.ndarr
     return [(point, ()) for point in points if not np.array_equal(point, fit.z)]
 
 
-def _draws(
-    fit: Fit, count: int, generator: np.random.Generator, rounds: int
-) -> list[tuple[np.ndarray, tuple[float, ...]]]:
+def _draws(fit: Fit, count: int, generator: np.random.Generator) -> list[tuple[np.ndarray, tuple[float, ...]]]:
     factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
-    starts = []
-    for _ in range(rounds):
-        starts += [(fit.z + width * (generator.standard_normal(len(fit.z)) @ factor), warm) for width, warm in AROUND]
-        for width, warm in AFAR:
-            ordinary = width * generator.standard_normal(count)
-            starts.append((np.concatenate([ordinary, fit.z[count:]]), warm))
+    starts = [(fit.z + width * (generator.standard_normal(len(fit.z)) @ factor), warm) for width, warm in AROUND]
+    for width, warm in AFAR:
+        ordinary = width * generator.standard_normal(count)
+        starts.append((np.concatenate([ordinary, fit.z[count:]]), warm))
     return starts
 
 

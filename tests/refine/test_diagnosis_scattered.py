@@ -42,8 +42,8 @@ def test_what_others_found_for_the_ordinary_numbers_is_tried(stuck):
     (best,) = scattered(clip, [fit], [], count, 0)
     biased = fit.hypothesis.added(term("mask_bias", -1, clip.frames))
     wide = clip.fit(biased, np.concatenate([fit.z, np.zeros(len(biased.bounds[0]) - count)]), 2)
-    (without,) = scattered(clip, [wide], [], count, 0, rounds=0)
-    (with_it,) = scattered(clip, [wide], [best], count, 0, rounds=0)
+    (without,) = scattered(clip, [wide], [], count, 0, drawn=False)
+    (with_it,) = scattered(clip, [wide], [best], count, 0, drawn=False)
     assert without is wide
     assert with_it.evidence > wide.evidence + 20
 
