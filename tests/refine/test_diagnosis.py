@@ -201,6 +201,12 @@ def changed(changes):
         ({"closed": 0.05, "held_out": 60.0, "inimitable": 1.0}, "single"),
         ({"closed": 0.2}, "unknown"),
         ({"closed": 0.2, "inimitable": 1.0}, "single"),
+        ({"closed": 0.05, "held_out": 9.0, "tilted": 1.0}, "single"),
+        ({"closed": 0.05, "held_out": 7.0, "tilted": 1.0}, "unknown"),
+        ({"closed": 0.2, "held_out": 9.0, "tilted": 1.0}, "single"),
+        ({"closed": 0.2, "held_out": 7.0, "tilted": 1.0}, "unknown"),
+        ({"closed": 0.05, "lead": 110.0, "structure_before": 1.2, "tilted": 1.0}, "none"),
+        ({"structure_after": 3.0, "margin": 30.0, "tilted": 1.0}, "unknown"),
         ({"closed": 0.2, "structure_after": 0.75}, "single"),
         ({"closed": 0.2, "structure_after": 0.75, "structure_first": 0.85}, "unknown"),
         ({"closed": 0.05, "structure_after": 0.75}, "unknown"),
@@ -302,6 +308,7 @@ def test_levels_of_a_video_are_its_own_and_a_name_is_no_likelier_than_its_effect
         (290.0, 0.05, {}, "single"),
         (310.0, 0.05, {"inimitable": 1.0}, "single"),
         (310.0, 0.05, {"inimitable": 1.0, "held_out": 20.0}, "unknown"),
+        (310.0, 0.05, {"tilted": 1.0}, "single"),
     ],
 )
 def test_one_effect_of_two_that_lead_must_close_the_gap_alone(second, closed, changes, kind):
@@ -309,14 +316,22 @@ def test_one_effect_of_two_that_lead_must_close_the_gap_alone(second, closed, ch
     one, two = SimpleNamespace(fit="one", lead=300.0), SimpleNamespace(fit="two", lead=second)
     asked = []
     said = upheld(
-        answer(told, [300.0, 150.0]),
+        answer(told, [300.0, 150.0], video=True),
         SimpleNamespace(candidates=(one,), pairs=(two,)),
         told,
         lambda fit: asked.append(fit) or closed,
+        video=True,
     )
     assert said.kind == kind
-    # An effect that contacts do not imitate needs not ask where it gains.
-    assert asked == (["one"] if second > 300.0 and not (told.inimitable and told.held_out > 40.0) else [])
+    # An effect that contacts do not imitate, or that tilts the world, needs not ask where it gains.
+    gains = (told.inimitable and told.held_out > 40.0) or told.tilted
+    assert asked == (["one"] if second > 300.0 and not gains else [])
+
+
+def test_of_poses_what_tilts_the_world_must_close_the_gap_as_well():
+    told = dataclasses.replace(SIGNS, closed=0.05, tilted=1.0)
+    assert answer(told, [300.0, 150.0], video=True).kind == "single"
+    assert answer(told, [300.0, 150.0]).kind == "unknown"
 
 
 def test_of_two_named_effects_the_better_one_is_the_surer():
