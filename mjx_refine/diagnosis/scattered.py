@@ -34,9 +34,7 @@ WARMING, LOOK, GO_ON, REST = 6, 4, 3, 6
 on, and for how many iterations."""
 
 
-def scattered(
-    clip: ClipFit, fits: Sequence[Fit], sources: Sequence[Fit], count: int, seed: int, drawn: bool = True
-) -> list[Fit]:
+def scattered(clip: ClipFit, fits: Sequence[Fit], sources: Sequence[Fit], count: int, seed: int) -> list[Fit]:
     """The fits, or better ones of the same hypotheses from other places.
 
     Args:
@@ -45,13 +43,12 @@ def scattered(
       sources: other hypotheses' fits, whose ordinary numbers are tried as well.
       count: how many numbers are ordinary.
       seed: of the draws.
-      drawn: whether starts are drawn as well.
     """
     rows: list[tuple[Fit, np.ndarray, tuple[float, ...]]] = []
     owners: list[int] = []
     for k, fit in enumerate(fits):
         generator = np.random.default_rng([seed, k])
-        starts = _others(fit, sources, count) + (_draws(fit, count, generator) if drawn else [])
+        starts = _others(fit, sources, count) + _draws(fit, count, generator)
         rows += [(fit, np.clip(z, *fit.hypothesis.bounds), warm) for z, warm in starts]
         owners += [k] * len(starts)
     looks = clip.crew.each(clip, _look, rows)

@@ -56,7 +56,7 @@ clips and wrong on two, where ``unknown`` had been as wrong; those that left mor
 GAINED = 8.0
 """Gain on frames that no fit has seen from which what tilts the world is named however little of the gap it closes: on seeds 15
 to 26 of the withheld exams five such with gains of 10 to 91 had been ``unknown``: four rightly found, and one a false alarm by
-either answer; in 23 videos without effect of seeds 22 to 26 whatever led gained 3 at most."""
+either answer; in 23 videos without effect and with measured flow of seeds 22 to 26 whatever led gained 3 at most."""
 
 STRANGE, CLEAR, STRANGEST = 1.3, 150.0, 3.2
 """Structure of the residuals above which the named effect is not what, or not all that, is missing; the margin over the next
