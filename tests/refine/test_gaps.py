@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from mjx_refine.diagnosis import gaps
 from mjx_refine.diagnosis.gaps import gap_between
 from mjx_refine.diagnosis.measure import measure
 from mjx_refine.observation import Observation
@@ -52,6 +53,29 @@ def test_what_stays_as_it_is_may_stand_side_by_side():
 
 def test_a_single_mask_has_no_gap():
     assert gap_between(np.minimum(_passing(4.0), 1)) == 0.0
+
+
+def _covered(by: float, hides: bool = True) -> np.ndarray:
+    """A small disc that goes behind another, both masks too thin by so much [px]; or shrinks beside it."""
+    masks = np.zeros((2 * FRAMES, HEIGHT, WIDTH), np.int32)
+    for t in range(2 * FRAMES):
+        near = _disc(90, 45, 26)
+        far = _disc(56 + 0.7 * t, 45 + 0.3 * t, 9) if hides else _disc(90, 3 + 0.3 * t, 8)
+        masks[t][_thinner(far & ~near, by)] = 2
+        masks[t][_thinner(near, by)] = 1
+    return masks
+
+
+@pytest.mark.parametrize("by", [2.0, 3.0])
+def test_what_loses_area_while_it_stays_as_far_apart_is_hidden(by, monkeypatch):
+    assert gap_between(_covered(by)) == pytest.approx(2 * by, abs=1.5)
+    # Its outline is too short to tell of it.
+    monkeypatch.setattr(gaps, "HELD", 99)
+    assert gap_between(_covered(by)) == 0.0
+
+
+def test_what_comes_nearer_is_not_hidden():
+    assert gap_between(_covered(2.0, hides=False)) == 0.0
 
 
 def test_outlines_along_a_gap_are_not_measured():
