@@ -22,7 +22,15 @@ from mjx_refine.search.features import DIRECTIONS
 from mjx_refine.view.moments import whole_function
 from mjx_refine.view.outline import Arrays, directions, padded, place, support_of
 from mjx_refine.view.points import point_flow_function
-from mjx_refine.view.seen import MANY, changed_moments, directions_for, outline_function
+from mjx_refine.view.seen import (
+    MANY,
+    bends,
+    bent_flow,
+    changed_moments,
+    directions_for,
+    outline_function,
+    straight_pixels,
+)
 
 ROWS = 8
 """Candidates that are predicted at a time, a line search's or a part of derivatives': one size is compiled, which takes seconds,
@@ -102,7 +110,10 @@ class Predictor:
         poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
         seen = acting.apparent(poses, batch, self.fps)
         count = directions_for(batch, DIRECTIONS) if acting.changes_outlines(batch) else 0
-        told, whole, flow = self._predicted(seen, batch, count)
+        bent = straight_pixels(seen, batch, self.pixels, self.image, self.fps) if bends(batch) else None
+        told, whole, flow = self._predicted(seen, batch, self.pixels[None] if bent is None else bent[0], count)
+        if bent is not None:
+            flow = bent_flow(flow, bent[1], self.pixels, batch, self.image, self.fps)
         flow = flow[:, :-1]
         reach = told[0]
         if count:
@@ -124,7 +135,6 @@ class Predictor:
             change = acting.outline_change(batch, view)
             reach = (reach + change)[..., :: count // DIRECTIONS]
             whole = changed_moments(whole, batch, view, change)
-            flow = self._seen_flow(flow, batch, focal)
         if self.drawn:
             flow = drawn_along(flow, whole)
         background = self._background(batch, len(poses), poses.shape[1])
@@ -150,35 +160,28 @@ class Predictor:
         beyond = np.stack([(across - row[:-1, :, None]).max(-1) for row in reach])
         return scipy.special.expit((beyond - self.blur) / EDGE)
 
-    def _predicted(self, seen: np.ndarray, batch: SceneBatch, count: int):
-        """``_predict`` of rows, ``ROWS`` at a time."""
-        pixels, found = jnp.asarray(self.pixels, jnp.float32), []
+    def _predicted(self, seen: np.ndarray, batch: SceneBatch, pixels: np.ndarray, count: int):
+        """``_predict`` of rows, ``ROWS`` at a time; ``pixels`` are one row for all, or each one's own."""
+        pixels, found = pixels.astype(np.float32), []
         for first in range(0, len(seen), ROWS):
             rows = slice(first, min(first + ROWS, len(seen)))
             device = padded(seen[rows], batch[rows], (ROWS,))
+            # The same program serves both.
+            own = pixels[rows] if len(pixels) == len(seen) else pixels
+            own = np.concatenate([own, np.repeat(own[:1], ROWS - len(own), 0)])
             # What follows is prepared while this is computed.
-            found.append((rows.stop - first, _predict(self.shapes, device, pixels, self.image, count)))
+            found.append((rows.stop - first, _predict(self.shapes, device, own, self.image, count)))
         parts = [jax.tree.map(lambda a, n=n: np.asarray(a, np.float64)[:n], one) for n, one in found]
         return parts[0] if len(parts) == 1 else jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
     def warm(self, frames: int) -> None:
         """Compiles predictions of clips of so many frames."""
-        count, pixels = len(self.shapes), jnp.asarray(self.pixels, jnp.float32)
+        count, pixels = len(self.shapes), np.repeat(self.pixels[None].astype(np.float32), ROWS, 0)
         for directed in (DIRECTIONS, 0, MANY):
             poses = np.tile([0.0, 2.0, 0.5, 1.0, 0.0, 0.0, 0.0], (ROWS, frames, count, 1))
             place, angle = np.tile([0.0, -2.0, 4.0], (ROWS, 1)), np.ones(ROWS)
             arrays = (poses, np.full((ROWS, count, 3), 0.3), place, angle, angle)
             _predict(self.shapes, tuple(jnp.asarray(a, jnp.float32) for a in arrays), pixels, self.image, directed)
-
-    def _seen_flow(self, flow: np.ndarray, batch: SceneBatch, focal: np.ndarray) -> np.ndarray:
-        here = np.broadcast_to(self.pixels[None, :-1], flow.shape)
-        bent = acting.warped(batch, here + flow, focal, self.image) - acting.warped(batch, here, focal, self.image)
-        readout = sum(e.values[:, 0] for e in batch.effects if e.name == "rolling_shutter")
-        if np.ndim(readout):
-            # The later row is exposed later.
-            longer = np.asarray(readout)[:, None, None, None] * self.fps * bent[..., 1] / self.image[1]
-            bent = bent * (1 + longer)[..., None]
-        return bent
 
     def _background(self, batch: SceneBatch, count: int, frames: int) -> np.ndarray:
         """Flow of what stands still, at ``places``: of the floor, or of infinity above the horizon."""

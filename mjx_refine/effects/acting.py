@@ -240,9 +240,9 @@ def changes_outlines(batch: SceneBatch) -> bool:
     return any(kind.drawn for kind, _ in _acting(batch))
 
 
-def shrinks_outlines(batch: SceneBatch) -> bool:
-    """Whether an effect takes so much off corners of outlines that its change needs many directions."""
-    return any(kind.shrinks(effect.values) for kind, effect in _acting(batch))
+def needs_many_directions(batch: SceneBatch) -> bool:
+    """Whether what an effect does to outlines is only told in many directions."""
+    return any(kind.fine(effect.values) for kind, effect in _acting(batch))
 
 
 def outline_change(batch: SceneBatch, view: OutlineView) -> Float[np.ndarray, "batch frames objects directions"]:
@@ -253,6 +253,15 @@ def outline_change(batch: SceneBatch, view: OutlineView) -> Float[np.ndarray, "b
         if told is not None:
             total = total + told
     return total
+
+
+def outlines_moved(
+    batch: SceneBatch, view: OutlineView
+) -> Float[np.ndarray, "batch frames objects directions 2"] | None:
+    """How far effects move points of outlines [px], or None where none does."""
+    found = [kind.moved(view, effect.target, effect.values) for kind, effect in _acting(batch)]
+    told = [one for one in found if one is not None]
+    return sum(told[1:], told[0]) if told else None
 
 
 def overdrawn(batch: SceneBatch) -> Float[np.ndarray, "batch"] | None:
@@ -271,6 +280,11 @@ def hidden_polygons(
         if told is not None:
             return told
     return None
+
+
+def warps(batch: SceneBatch) -> bool:
+    """Whether an effect moves points of the picture."""
+    return any(type(kind).warp is not EffectKind.warp for kind, _ in _acting(batch))
 
 
 def warped(

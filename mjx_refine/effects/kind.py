@@ -240,12 +240,17 @@ class EffectKind:
         """The camera's turn in its own axes (right, up, back), (batch, frames, 3, 3), and its travel [m]."""
         return None
 
-    def shrinks(self, values: np.ndarray) -> bool:
-        """Whether ``outline`` takes so much off corners that it needs many directions."""
+    def fine(self, values: np.ndarray) -> bool:
+        """Whether what it does to outlines is only told in many directions."""
         return False
 
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         """What is added to the support functions [px], broadcast to (batch, frames, objects, directions)."""
+        return None
+
+    def moved(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
+        """How far points of outlines go (batch, frames, objects, directions, 2) [px], where ``outline`` is their way along the
+        normals; None where it widens outlines instead."""
         return None
 
     def hidden(self, outline: np.ndarray, values: np.ndarray) -> np.ndarray | None:

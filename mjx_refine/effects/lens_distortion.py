@@ -25,5 +25,8 @@ class LensDistortion(EffectKind):
         square = (offset**2).sum(-1, keepdims=True) / focal.reshape(-1, *ones) ** 2
         return values[:, 0].reshape(-1, *ones) * np.minimum(square, 4.0) * offset
 
+    def moved(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
+        return self.warp(view.contact, view.focal, view.image, values)
+
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         return (self.warp(view.contact, view.focal, view.image, values) * view.normals).sum(-1)

@@ -36,7 +36,7 @@ class MaskBias(EffectKind):
     def overdrawn(self, values: np.ndarray) -> np.ndarray | None:
         return np.maximum(values[:, 0], 0.0)
 
-    def shrinks(self, values: np.ndarray) -> bool:
+    def fine(self, values: np.ndarray) -> bool:
         return bool((values[:, 0] < 0).any())
 
 

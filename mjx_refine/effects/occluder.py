@@ -6,6 +6,10 @@ import numpy as np
 
 from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, OutlineView, Start
 
+COARSE = 16
+"""Directions in which what is left of outlines is told; in those between as in the one before. Of areas and their middles,
+which all directions tell, it is ``hidden`` that speaks."""
+
 
 def _beyond(contact: np.ndarray, normals: np.ndarray, axis: int, sign: float, side: np.ndarray) -> np.ndarray:
     """Support function of the polygon of ``contact`` points cut at sign * x[axis] > sign * side; -inf where nothing is left.
@@ -48,13 +52,19 @@ class Occluder(EffectKind):
         EffectParameter(side, "px", 8.0, -1e4, 1e5, 0.0, None) for side in ("left", "top", "right", "bottom")
     )
 
+    def fine(self, values: np.ndarray) -> bool:
+        return True
+
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         left, top, right, bottom = (values[:, k, None, None, None] for k in range(4))
-        most = np.full(view.reach.shape, -np.inf)
+        step = max(len(view.normals) // COARSE, 1)
+        contact, normals, reach = view.contact[..., ::step, :], view.normals[::step], view.reach[..., ::step]
+        most = np.full(reach.shape, -np.inf)
         # What is seen is the outline's part to the left, the right, above and below of the rectangle: four convex pieces.
         for axis, sign, side in ((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom)):
-            most = np.maximum(most, _beyond(view.contact, view.normals, axis, sign, side))
-        return np.where(np.isfinite(most), np.minimum(most - view.reach, 0.0), np.nan)
+            most = np.maximum(most, _beyond(contact, normals, axis, sign, side))
+        change = np.where(np.isfinite(most), np.minimum(most - reach, 0.0), np.nan)
+        return np.repeat(change, step, -1)[..., : len(view.normals)]
 
     def hidden(self, outline: np.ndarray, values: np.ndarray) -> np.ndarray | None:
         left, top, right, bottom = (values[:, k, None, None, None] for k in range(4))

@@ -35,6 +35,9 @@ class OutlineShape(EffectKind):
         EffectParameter("taper", "1", 0.15, -0.9, 0.9),
     )
 
+    def fine(self, values: np.ndarray) -> bool:
+        return True
+
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         added = np.zeros(view.reach.shape)
         normal = view.facing[:, :, target]

@@ -11,17 +11,20 @@ from mjx_refine.compile_cache import jit_quickly
 from mjx_refine.scene import Shape
 from mjx_refine.view.distance import surface
 from mjx_refine.view.frames import make_frames
-from mjx_refine.view.outline import Arrays, in_pieces, larger
+from mjx_refine.view.outline import PIECE, Arrays, in_pieces, larger, padded
 
 
 def point_flow_function(
-    shapes: tuple[Shape, ...], arrays: Arrays, pixels: Float[Array, "frames objects points 2"], image: tuple[int, int]
+    shapes: tuple[Shape, ...],
+    arrays: Arrays,
+    pixels: Float[Array, "*batch frames objects points 2"],
+    image: tuple[int, int],
 ) -> Float[Array, "batch frames objects points 2"]:
     """``point_flow`` as a pure function of poses, sizes and cameras; its derivatives are finite everywhere."""
     poses, size, position, pitch, fovy = arrays
     batch, length = poses.shape[:2]
     frames = make_frames(poses, size, position, pitch, fovy, image[1])
-    tiled = jnp.broadcast_to(pixels[None], (batch, *pixels.shape)).reshape(batch * length, *pixels.shape[1:])
+    tiled = jnp.broadcast_to(pixels, (batch, *pixels.shape[-4:])).reshape(batch * length, *pixels.shape[-3:])
     focal = frames.focal[:, None]
     result = []
     for n, shape in enumerate(shapes):
@@ -47,12 +50,21 @@ _point_flow = jit_quickly(point_flow_function, static_argnums=(0, 3))
 def point_flow(
     poses: Float[np.ndarray, "batch frames objects 7"],
     batch: SceneBatch,
-    pixels: Float[np.ndarray, "frames objects points 2"],
+    pixels: Float[np.ndarray, "*batch frames objects points 2"],
     image: tuple[int, int],
 ) -> Float[np.ndarray, "batch frames objects points 2"]:
     """Flow [px/frame] of each object's surface where it is seen at ``pixels`` (x, y) [px], as if nothing hid it.
 
-    Where the ray misses the object, that of a point fixed to it beside its outline; zero in the last frame.
+    Where the ray misses the object, that of a point fixed to it beside its outline; zero in the last frame. ``pixels`` are the
+    same for all of the batch, or each one's own.
     """
     where = np.asarray(pixels, np.float32)
-    return in_pieces(lambda arrays: _point_flow(batch.shapes, arrays, where, image), poses, batch)
+    if where.ndim == 4:
+        return in_pieces(lambda arrays: _point_flow(batch.shapes, arrays, where, image), poses, batch)
+    parts = []
+    for first in range(0, len(poses), PIECE):
+        rows = slice(first, first + PIECE)
+        own = np.concatenate([where[rows], np.repeat(where[:1], max(first + PIECE - len(poses), 0), 0)])
+        found = _point_flow(batch.shapes, padded(poses[rows], batch[rows], (PIECE,)), own, image)
+        parts.append(np.asarray(found))
+    return np.concatenate(parts)[: len(poses)]

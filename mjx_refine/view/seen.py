@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import TypeAlias
@@ -20,12 +21,15 @@ from mjx_refine.view.outline import Arrays, directions, larger, padded, place, s
 from mjx_refine.view.points import point_flow
 
 MANY = 128
-"""Directions that tell what is left of corners where outlines shrink."""
+"""Directions that tell what is left of corners where outlines shrink, bulge or are hidden."""
+
+UNBENDING = 6
+"""Steps that undo a lens, each of which leaves a few hundredths of what the last one left."""
 
 
 def directions_for(batch: SceneBatch, count: int) -> int:
     """How many directions, a multiple of ``count``, the effects of ``batch`` need."""
-    return count * -(-MANY // count) if acting.shrinks_outlines(batch) else count
+    return count * -(-MANY // count) if acting.needs_many_directions(batch) else count
 
 
 def outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int], count: int):
@@ -61,16 +65,19 @@ def changed_moments(
 ) -> Float[np.ndarray, "batch frames objects 3"]:
     """Centroids and equivalent radii [px] of silhouettes that effects change by ``change``, or hide in part.
 
-    To first order in the change: the polygon of contact points is moved along its normals, and its own moments' change is
-    added to the exact ones. Where directions are many, points move along their tangents as well, as gradients of the
-    changed support function do.
+    Points of the polygon of contact points go where effects move them, and to first order along its normals where these widen
+    it; the polygon's own moments' change is added to the exact ones. Where directions are many, what is widened moves along
+    its tangents as well, as gradients of the changed support function do.
     """
     before = polygon_sums(view.contact)
     hidden = acting.hidden_polygons(batch, view.contact)
     if hidden is None:
-        moved = view.contact + change[..., None] * view.normals
+        shift = acting.outlines_moved(batch, view)
+        moved = view.contact if shift is None else view.contact + shift
+        wider = change if shift is None else change - (shift * view.normals).sum(-1)
+        moved = moved + wider[..., None] * view.normals
         if change.shape[-1] >= MANY:
-            slope = (np.roll(change, -1, -1) - np.roll(change, 1, -1)) / (4 * np.pi / change.shape[-1])
+            slope = (np.roll(wider, -1, -1) - np.roll(wider, 1, -1)) / (4 * np.pi / wider.shape[-1])
             moved = moved + slope[..., None] * np.stack([-view.normals[:, 1], view.normals[:, 0]], -1)
         after = polygon_sums(moved)
     else:
@@ -137,9 +144,12 @@ def seen_point_flow(
     image: tuple[int, int],
     fps: float,
 ) -> Float[np.ndarray, "batch frames objects points 2"]:
-    """``point_flow`` with the effects of ``batch`` [px/frame]; the lens's bend of the pixels themselves is left out."""
-    flow = point_flow(acting.apparent(poses, batch, fps), batch, pixels, image)
-    return bent_flow(flow, pixels, batch, image, fps) if acting.changes_outlines(batch) else flow
+    """``point_flow`` with the effects of ``batch`` [px/frame]."""
+    seen = acting.apparent(poses, batch, fps)
+    if not bends(batch):
+        return point_flow(seen, batch, pixels, image)
+    straight, later = straight_pixels(seen, batch, pixels, image, fps)
+    return bent_flow(point_flow(seen, batch, straight, image), later, pixels, batch, image, fps)
 
 
 Look: TypeAlias = Callable[
@@ -163,18 +173,75 @@ def seen_reach_and_flow(
     return seen_supports(poses, batch, image, count, fps), flow
 
 
+def bends(batch: SceneBatch) -> bool:
+    """Whether at a pixel is seen what would be elsewhere without a lens, or at the frame's own moment."""
+    return acting.warps(batch) or rolls(batch)
+
+
+def straight_pixels(
+    seen: Float[np.ndarray, "batch frames objects 7"],
+    batch: SceneBatch,
+    pixels: Float[np.ndarray, "frames objects points 2"],
+    image: tuple[int, int],
+    fps: float,
+) -> tuple[Float[np.ndarray, "batch frames objects points 2"], Float[np.ndarray, "batch frames objects points 2"]]:
+    """Where what is seen at ``pixels`` would be without a lens and at its frame's moment [px], and how much more it flows since
+    its row is exposed later [px/frame]: objects go as their centres do.
+
+    Args:
+      seen: ``apparent`` poses.
+      batch: with its effects.
+      pixels: of each object [px].
+      image: (width, height) [px].
+      fps: frames a second.
+    """
+    here = np.broadcast_to(pixels[None], (len(seen), *pixels.shape))
+    straight = _unwarped(batch, here, focal_length(batch, image), image)
+    if not rolls(batch) or seen.shape[1] < 2:
+        return straight, np.zeros_like(straight)
+    velocity = np.gradient(_centres(seen, batch, image), axis=1)[..., None, :]
+    gain = np.gradient(velocity, axis=1)
+    late = (readout(batch, fps, image) * (here[..., 1] - 0.5 * image[1]))[..., None]
+    return straight - late * (velocity + 0.5 * late * gain), late * gain
+
+
 def bent_flow(
     flow: Float[np.ndarray, "batch frames objects points 2"],
+    later: Float[np.ndarray, "batch frames objects points 2"],
     pixels: Float[np.ndarray, "frames objects points 2"],
     batch: SceneBatch,
     image: tuple[int, int],
     fps: float,
 ) -> Float[np.ndarray, "batch frames objects points 2"]:
-    """Flow as lens and shutter show it."""
+    """Flow at ``pixels`` as lens and shutter show it [px/frame]; ``flow`` is that without them where ``straight_pixels`` says,
+    and ``later`` what it says of its change."""
     focal = focal_length(batch, image)
-    here = np.broadcast_to(pixels[None], flow.shape)
-    bent = acting.warped(batch, here + flow, focal, image) - acting.warped(batch, here, focal, image)
+    straight = _unwarped(batch, np.broadcast_to(pixels[None], flow.shape), focal, image)
+    bent = acting.warped(batch, straight + flow + later, focal, image) - pixels
     return bent if not rolls(batch) else bent * (1 + readout(batch, fps, image) * bent[..., 1])[..., None]
+
+
+def _unwarped(
+    batch: SceneBatch,
+    here: Float[np.ndarray, "batch frames objects points 2"],
+    focal: Float[np.ndarray, "batch"],
+    image: tuple[int, int],
+) -> Float[np.ndarray, "batch frames objects points 2"]:
+    """Where without a lens is what is seen at ``here`` [px]: near it, since a lens bends pictures a little."""
+    straight = here
+    for _ in range(UNBENDING if acting.warps(batch) else 0):
+        straight = straight + here - acting.warped(batch, straight, focal, image)
+    return straight
+
+
+def _centres(
+    seen: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch, image: tuple[int, int]
+) -> Float[np.ndarray, "batch frames objects 2"]:
+    """Where the camera, standing still, sees the middles of objects [px]."""
+    axes, place = acting.camera_path(dataclasses.replace(batch, effects=()), 1, 1.0)
+    local = np.einsum("btji,btnj->btni", axes, seen[..., :3] - place[:, :, None])
+    depth = np.maximum(-local[..., 2:], 0.02)
+    return focal_length(batch, image)[:, None, None, None] * local[..., :2] * [1.0, -1.0] / depth + np.divide(image, 2)
 
 
 def rolls(batch: SceneBatch) -> bool:
