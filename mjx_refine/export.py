@@ -44,9 +44,9 @@ def export_xml(scene: Scene, fps: float = 30.0) -> str:
     Bodies lie at their initial poses (``qpos0``); the keyframe ``start`` adds the initial velocities. The fixed camera
     ``camera`` is the scene's, and the viewer's free camera starts there too.
 
-    Of the effects MuJoCo's own elements hold ``slope``, ``offset_com``, ``camera_roll``, ``wind`` and a linear ``drag``
-    exactly, and ``hidden_obstacle`` as a plane: what else pushes a body while it touches that plane is held off too, a
-    body that starts far behind it is thrown out, and slow slip is stopped where the effect lets it creep.
+    Of the effects MuJoCo's own elements hold ``slope``, ``offset_com``, ``camera_roll``, ``wind`` without slowness and
+    a linear ``drag`` exactly, and ``hidden_obstacle`` as a plane: what else pushes a body while it touches that plane is held
+    off too, a body that starts far behind it is thrown out, and slow slip is stopped where the effect lets it creep.
 
     Args:
       scene: with no other effects.
@@ -182,6 +182,11 @@ def _check_effects(batch: SceneBatch) -> None:
                 raise InputError(
                     f"effect drag: MuJoCo's XML holds only its linear part, up to 100 1/s times the mass; {remedy}"
                 )
+        if effect.name == "wind" and effect.values[0, 2] != 0:
+            raise InputError(
+                f"effect wind: slowness = {effect.values[0, 2]:g}; MuJoCo's XML holds only a wind that presses the same at all "
+                f"speeds (slowness 0); {remedy}"
+            )
 
 
 def _obstacles(

@@ -2,31 +2,59 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
-from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Loads, Motion
+from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Loads, Motion, Start
 
 
 class Wind(EffectKind):
-    """F = pressure times a quarter of the body's surface, which is its mean shadow (Cauchy's formula)."""
+    """F = p A |r| r, r = w - slowness v: what presses a body at rest is p A w, and the less the more it goes with the air.
+
+    w is the wind's direction, p its pressure on what is at rest, A a quarter of the body's surface, which is its mean shadow
+    (Cauchy's formula), and ``slowness`` one over the air's speed; at 0 the force is the same at all speeds. Drag is quadratic in
+    the velocity relative to the air (White, Fluid Mechanics, 7.6).
+    """
 
     name = "wind"
     sentence = "moving air pushes everything one way"
     experiment = "Film a body at rest on the floor, and one in flight: wind pushes both, a slope only what lies on it."
     physical = True
-    parameters = (EffectParameter("x", "Pa", 10.0, -1e5, 1e5), EffectParameter("y", "Pa", 10.0, -1e5, 1e5))
+    parameters = (
+        EffectParameter("x", "Pa", 10.0, -1e5, 1e5),
+        EffectParameter("y", "Pa", 10.0, -1e5, 1e5),
+        EffectParameter("slowness", "s/m", 0.15, 0.0, 1.0),
+    )
 
     def loads(self, motion: Motion, target: int, values: np.ndarray) -> Loads | None:
         force = np.zeros_like(motion.position)
-        force[..., :2] = values[:, None] * mean_shadow(motion.batch)[..., None]
-        return force, np.zeros_like(force)
+        shadow = mean_shadow(motion.batch)[..., None]
+        pressure = values[:, None, :2]
+        if not values[:, 2].any():
+            force[..., :2] = pressure * shadow
+            return force, np.zeros_like(force)
+        strength = np.linalg.norm(pressure, axis=-1, keepdims=True)
+        force[..., :2] = pressure / np.maximum(strength, 1e-300)
+        slowness = values[:, 2, None, None]
+        against = force - slowness * motion.velocity
+        resistance = strength * shadow * np.linalg.norm(against, axis=-1, keepdims=True)
+        # One explicit step may at most stop the body.
+        most = 100.0 * motion.batch.mass[..., None] / np.maximum(slowness, 1e-9)
+        return np.minimum(resistance, most) * against, np.zeros_like(force)
 
     def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
-        return np.inf
+        return 0.0 if values[:, 2].any() else np.inf
+
+    def still(self, view: FitView, target: int) -> Start:
+        start = super().still(view, target)
+        # Without pressure no speed of the air does anything.
+        return dataclasses.replace(start, columns=start.columns[:2])
 
     def widths(self, view: FitView, target: int) -> np.ndarray:
         # A metre per second squared or two on the object that feels it most.
-        return np.full(2, 1.5 * float((view.batch.mass / mean_shadow(view.batch)).min()))
+        push = 1.5 * float((view.batch.mass / mean_shadow(view.batch)).min())
+        return np.array([push, push, self.parameters[2].width])
 
 
 def mean_shadow(batch) -> np.ndarray:

@@ -60,6 +60,21 @@ def test_wind_pushes_every_object_by_its_mean_shadow():
         np.testing.assert_allclose(poses[-1, k, :2] - poses[0, k, :2], expected, rtol=1e-9)
 
 
+def test_wind_is_drag_by_air_that_moves():
+    # F = p A |r| r with r = w - v / 5 for air of 5 m/s along x; m dv/dt = -k (5 - v)^2 has v = 5 - 5 / (1 + 5 k t).
+    poses = rolled_out(effect("wind", x=40.0, slowness=0.2))
+    shadow, mass, time = np.pi * 0.2**2, 0.7, (len(poses) - 1) / FPS
+    k = 40.0 * shadow / 25.0 / mass
+    assert speeds(poses)[-1][0] == pytest.approx(5.0 - 5.0 / (1.0 + 5.0 * k * time), rel=0.02)
+    still = rolled_out(effect("wind", x=40.0, slowness=0.2), linear_velocity=(5.0, 0.0, 0.0))
+    np.testing.assert_allclose(speeds(still), np.tile([5.0, 0.0, 0.0], (len(still) - 1, 1)), atol=1e-9)
+    # What flies across is held up as well.
+    across = rolled_out(effect("wind", x=40.0, slowness=0.2), linear_velocity=(0.0, 0.0, 5.0))
+    assert speeds(across)[-1][2] < 4.0
+    plain = rolled_out(effect("wind", x=40.0), linear_velocity=(0.0, 0.0, 5.0))
+    np.testing.assert_allclose(speeds(plain)[-1][2], 5.0, atol=1e-9)
+
+
 @pytest.mark.parametrize("time", [0.3, 0.30217, 0.4999])
 def test_a_push_is_an_impulse(time):
     poses = rolled_out(effect("push", "ball", time=time, x=0.7, y=-1.4, z=0.35), linear_velocity=(1.0, 0.0, 0.0))
@@ -212,6 +227,7 @@ IDLING = (
     effect("hidden_obstacle", "ball", angle=180.0, distance=-0.9, restitution=0.6),
     effect("friction_patch", x=0.5, y=0.0, radius=0.3, friction=0.05),
     effect("wind", x=60.0, y=20.0),
+    effect("wind", x=60.0, y=20.0, slowness=0.1),
 )
 
 
