@@ -70,10 +70,10 @@ def changed_moments(
     its tangents as well, as gradients of the changed support function do.
     """
     before = polygon_sums(view.contact)
-    hidden = acting.hidden_polygons(batch, view.contact)
+    shift = acting.outlines_moved(batch, view)
+    moved = view.contact if shift is None else view.contact + shift
+    hidden = acting.hidden_polygons(batch, moved)
     if hidden is None:
-        shift = acting.outlines_moved(batch, view)
-        moved = view.contact if shift is None else view.contact + shift
         wider = change if shift is None else change - (shift * view.normals).sum(-1)
         moved = moved + wider[..., None] * view.normals
         if change.shape[-1] >= MANY:
@@ -81,12 +81,12 @@ def changed_moments(
             moved = moved + slope[..., None] * np.stack([-view.normals[:, 1], view.normals[:, 0]], -1)
         after = polygon_sums(moved)
     else:
-        after = before - polygon_sums(hidden)
+        after = polygon_sums(moved) - polygon_sums(hidden)
     area = [np.maximum(np.abs(sums[..., 0]), 1e-9) for sums in (before, after)]
-    shift = after[..., 1:] / area[1][..., None] - before[..., 1:] / area[0][..., None]
+    middle = after[..., 1:] / area[1][..., None] - before[..., 1:] / area[0][..., None]
     ratio = np.sqrt(np.abs(after[..., 0]) / area[0])
     seen = np.isfinite(change).any(-1) & (ratio > 0.05)
-    result = np.concatenate([moments[..., :2] + shift, (moments[..., 2] * ratio)[..., None]], -1)
+    result = np.concatenate([moments[..., :2] + middle, (moments[..., 2] * ratio)[..., None]], -1)
     return np.where(seen[..., None], result, np.nan)
 
 
