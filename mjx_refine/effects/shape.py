@@ -41,7 +41,8 @@ class OutlineShape(EffectKind):
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         added = np.zeros(view.reach.shape)
         normal = view.facing[:, :, target]
-        extra = (polynomials(normal) * values[:, None, None, :COUNT]).sum(-1)
+        extra = polynomials(normal) @ values[:, None, :COUNT, None]
+        extra = extra[..., 0]
         rounding, taper = values[:, None, None, COUNT], values[:, None, None, COUNT + 1]
         extra = extra + worn(view.shapes[target], view.size[:, target], normal, rounding, taper)
         added[:, :, target] = extra * view.scale[:, :, target]
