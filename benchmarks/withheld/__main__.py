@@ -1,4 +1,4 @@
-"""`python -m benchmarks.withheld make | answer | left | score`: the diagnosis' withheld exam."""
+"""`python -m benchmarks.withheld make | answer | left | foretold | score`: the diagnosis' withheld exam."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import click
 import cv2
 
 from benchmarks.withheld import answer as answers_
-from benchmarks.withheld import exam, plan
+from benchmarks.withheld import exam, foretold, plan
 from benchmarks.withheld import left as lefts
 from benchmarks.withheld import score as scores
 from benchmarks.withheld import sheet as sheets
@@ -106,6 +106,16 @@ def score(folder: Path, answers: Path, out: Path | None) -> None:
     click.echo(text)
     if out is not None:
         write_text(out, text)
+
+
+@main.command("foretold")
+@click.argument("folder", metavar="EXAM", type=click.Path(path_type=Path, exists=True, file_okay=False))
+def foretold_errors(folder: Path) -> None:
+    """Prints how far predictions with the key's own numbers are off in the first frames: an open exam's, for development."""
+    click.echo("clip: centroid px (worst), radius px, flow px/frame; effects")
+    for one in foretold.foretold(folder):
+        numbers = f"{one.centroid:.2f} ({one.worst:.2f}), {one.radius:.2f}, {one.flow:.2f}"
+        click.echo(f"{one.clip}: {numbers}; {' and '.join(one.effects) or 'none'}")
 
 
 @main.command()
