@@ -13,7 +13,7 @@ from mjx_refine import files, rotations
 from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting, batch_with_effects
 from mjx_refine.effects.hidden_obstacle import damping_of, stiffness_of
-from mjx_refine.effects.wind import mean_shadow
+from mjx_refine.effects.wind import felt_shadow
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Camera, Scene
 from mjx_refine.sim.model import SUBSTEPS, contact_pairs, initial_state, model_fields
@@ -223,7 +223,7 @@ def _forces(root: ElementTree.Element, batch: SceneBatch, names: list[str]) -> N
     rows: list[tuple[str, int, str]] = []
     for values in _of(batch, "wind"):
         for i, name in enumerate(names):
-            rows += [(name, k, _numbers((values[k] * mean_shadow(batch)[0, i], 0.0, 0.0))) for k in range(2)]
+            rows += [(name, k, _numbers((values[k] * felt_shadow(batch)[0, i], 0.0, 0.0))) for k in range(2)]
     for effect in batch.effects:
         if effect.name == "drag":
             rows += [(names[effect.target], k, _numbers((0.0, 0.0, -effect.values[0, 0]))) for k in range(3)]

@@ -8,13 +8,18 @@ import numpy as np
 
 from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Loads, Motion, Start
 
+DRAG = {"sphere": 0.47, "cylinder": 0.8, "box": 1.05}
+"""Drag coefficients of blunt bodies at Reynolds numbers of 1e4 to 1e5 (Hoerner, Fluid-Dynamic Drag, 3; a short cylinder's is 0.7
+end-on and 0.8 to 1.2 across)."""
+
 
 class Wind(EffectKind):
-    """F = p A |r| r, r = w - slowness v: what presses a body at rest is p A w, and the less the more it goes with the air.
+    """F = c p A |r| r, r = w - slowness v: what presses a body at rest is c p A w, and the less the more it goes with the air.
 
-    w is the wind's direction, p its pressure on what is at rest, A a quarter of the body's surface, which is its mean shadow
-    (Cauchy's formula), and ``slowness`` one over the air's speed; at 0 the force is the same at all speeds. Drag is quadratic in
-    the velocity relative to the air (White, Fluid Mechanics, 7.6).
+    w is the wind's direction, p its pressure on the first object at rest, c the drag coefficient of the body's shape over the
+    first one's, A a quarter of the body's surface, which is its mean shadow (Cauchy's formula), and ``slowness`` one over the air's
+    speed; at 0 the force is the same at all speeds. Drag is quadratic in the velocity relative to the air (White, Fluid
+    Mechanics, 7.6).
     """
 
     name = "wind"
@@ -29,7 +34,7 @@ class Wind(EffectKind):
 
     def loads(self, motion: Motion, target: int, values: np.ndarray) -> Loads | None:
         force = np.zeros_like(motion.position)
-        shadow = mean_shadow(motion.batch)[..., None]
+        shadow = felt_shadow(motion.batch)[..., None]
         pressure = values[:, None, :2]
         if not values[:, 2].any():
             force[..., :2] = pressure * shadow
@@ -53,8 +58,14 @@ class Wind(EffectKind):
 
     def widths(self, view: FitView, target: int) -> np.ndarray:
         # A metre per second squared or two on the object that feels it most.
-        push = 1.5 * float((view.batch.mass / mean_shadow(view.batch)).min())
+        push = 1.5 * float((view.batch.mass / felt_shadow(view.batch)).min())
         return np.array([push, push, self.parameters[2].width])
+
+
+def felt_shadow(batch) -> np.ndarray:
+    """Mean shadows times how much more wind presses each shape than the first object's [m^2], (batch, objects)."""
+    more = np.array([DRAG[shape] for shape in batch.shapes]) / DRAG[batch.shapes[0]]
+    return mean_shadow(batch) * more
 
 
 def mean_shadow(batch) -> np.ndarray:

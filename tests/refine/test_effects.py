@@ -49,14 +49,16 @@ def test_magnus_bends_a_path_to_a_circle():
     assert np.ptp(poses[:, 0, 2]) < 1e-9
 
 
-def test_wind_pushes_every_object_by_its_mean_shadow():
+def test_wind_pushes_every_object_by_its_mean_shadow_and_shape():
     box = Body("box", "box", (0.1, 0.2, 0.3), (5.0, 0.0, 50.0), mass=2.0)
     can = Body("cylinder", "can", (0.1, 0.4), (-5.0, 0.0, 50.0))
     poses = rolled_out(effect("wind", x=10.0, y=-5.0), others=(box, can))
     surfaces = [4 * np.pi * 0.2**2, 8 * (0.1 * 0.2 + 0.2 * 0.3 + 0.1 * 0.3), 2 * np.pi * 0.1 * (0.1 + 0.4)]
     n = 8 * 30
-    for k, (surface, mass) in enumerate(zip(surfaces, (0.7, 2.0, 1.0), strict=True)):
-        expected = np.array([10.0, -5.0]) * surface / 4 / mass * STEP**2 * n * (n + 1) / 2
+    # Times the drag coefficients of a ball, a box and a can, over that of the ball, which is the first.
+    shapes = (1.0, 1.05 / 0.47, 0.8 / 0.47)
+    for k, (surface, mass, more) in enumerate(zip(surfaces, (0.7, 2.0, 1.0), shapes, strict=True)):
+        expected = np.array([10.0, -5.0]) * more * surface / 4 / mass * STEP**2 * n * (n + 1) / 2
         np.testing.assert_allclose(poses[-1, k, :2] - poses[0, k, :2], expected, rtol=1e-9)
 
 

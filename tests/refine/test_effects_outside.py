@@ -311,5 +311,5 @@ def test_what_xml_cannot_hold_is_refused_by_name(entry):
 
 
 def test_a_wind_with_a_speed_is_not_exported():
-    with pytest.raises(InputError, match="slowness = 0.2"):
+    with pytest.raises(InputError, match=r"slowness = 0\.2"):
         export_xml(dataclasses.replace(SCENE, effects=(effect("wind", x=20.0, slowness=0.2),)))
