@@ -17,8 +17,8 @@ class Wind(EffectKind):
     """F = c p A |r| r, r = w - slowness v: what presses a body at rest is c p A w, and the less the more it goes with the air.
 
     w is the wind's direction, p its pressure on the first object at rest, c the drag coefficient of the body's shape over the
-    first one's, A a quarter of the body's surface, which is its mean shadow (Cauchy's formula), and ``slowness`` one over the air's
-    speed; at 0 the force is the same at all speeds. Drag is quadratic in the velocity relative to the air (White, Fluid
+    first one's, A a quarter of the body's surface, which is its mean shadow (Cauchy's formula), and ``slowness`` one over the
+    air's speed; at 0 the force is the same at all speeds. Drag is quadratic in the velocity relative to the air (White, Fluid
     Mechanics, 7.6).
     """
 
