@@ -177,7 +177,7 @@ class Predictor:
     def warm(self, frames: int) -> None:
         """Compiles predictions of clips of so many frames."""
         count, pixels = len(self.shapes), np.repeat(self.pixels[None].astype(np.float32), ROWS, 0)
-        for directed in (DIRECTIONS, 0, MANY):
+        for directed in (DIRECTIONS, 0, *MANY):
             poses = np.tile([0.0, 2.0, 0.5, 1.0, 0.0, 0.0, 0.0], (ROWS, frames, count, 1))
             place, angle = np.tile([0.0, -2.0, 4.0], (ROWS, 1)), np.ones(ROWS)
             arrays = (poses, np.full((ROWS, count, 3), 0.3), place, angle, angle)

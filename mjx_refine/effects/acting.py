@@ -240,9 +240,9 @@ def changes_outlines(batch: SceneBatch) -> bool:
     return any(kind.drawn for kind, _ in _acting(batch))
 
 
-def needs_many_directions(batch: SceneBatch) -> bool:
-    """Whether what an effect does to outlines is only told in many directions."""
-    return any(kind.fine(effect.values) for kind, effect in _acting(batch))
+def directions_of_outlines(batch: SceneBatch) -> int:
+    """In how many directions what effects do to outlines must be told; 0: few do."""
+    return max((kind.directions(effect.values) for kind, effect in _acting(batch)), default=0)
 
 
 def outline_change(batch: SceneBatch, view: OutlineView) -> Float[np.ndarray, "batch frames objects directions"]:

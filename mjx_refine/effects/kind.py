@@ -240,9 +240,9 @@ class EffectKind:
         """The camera's turn in its own axes (right, up, back), (batch, frames, 3, 3), and its travel [m]."""
         return None
 
-    def fine(self, values: np.ndarray) -> bool:
-        """Whether what it does to outlines is only told in many directions."""
-        return False
+    def directions(self, values: np.ndarray) -> int:
+        """In how many directions what it does to outlines must be told; 0: few do."""
+        return 0
 
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         """What is added to the support functions [px], broadcast to (batch, frames, objects, directions)."""

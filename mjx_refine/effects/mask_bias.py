@@ -36,8 +36,8 @@ class MaskBias(EffectKind):
     def overdrawn(self, values: np.ndarray) -> np.ndarray | None:
         return np.maximum(values[:, 0], 0.0)
 
-    def fine(self, values: np.ndarray) -> bool:
-        return bool((values[:, 0] < 0).any())
+    def directions(self, values: np.ndarray) -> int:
+        return 128 if (values[:, 0] < 0).any() else 0
 
 
 def width_change(

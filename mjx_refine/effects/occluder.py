@@ -52,8 +52,8 @@ class Occluder(EffectKind):
         EffectParameter(side, "px", 8.0, -1e4, 1e5, 0.0, None) for side in ("left", "top", "right", "bottom")
     )
 
-    def fine(self, values: np.ndarray) -> bool:
-        return True
+    def directions(self, values: np.ndarray) -> int:
+        return 64
 
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         left, top, right, bottom = (values[:, k, None, None, None] for k in range(4))

@@ -35,14 +35,13 @@ class OutlineShape(EffectKind):
         EffectParameter("taper", "1", 0.15, -0.9, 0.9),
     )
 
-    def fine(self, values: np.ndarray) -> bool:
-        return True
+    def directions(self, values: np.ndarray) -> int:
+        return 64
 
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         added = np.zeros(view.reach.shape)
         normal = view.facing[:, :, target]
-        extra = polynomials(normal) @ values[:, None, :COUNT, None]
-        extra = extra[..., 0]
+        extra = np.einsum("kbtd,bk->btd", polynomials(normal), values[:, :COUNT])
         rounding, taper = values[:, None, None, COUNT], values[:, None, None, COUNT + 1]
         extra = extra + worn(view.shapes[target], view.size[:, target], normal, rounding, taper)
         added[:, :, target] = extra * view.scale[:, :, target]
@@ -77,7 +76,7 @@ def worn(
 
 
 def polynomials(normal: np.ndarray) -> np.ndarray:
-    """Real harmonics of degrees 2, 3 and 4 at unit vectors, up to factors of order one; (..., COUNT)."""
+    """Real harmonics of degrees 2, 3 and 4 at unit vectors (..., 3), up to factors of order one; (COUNT, ...)."""
     x, y, z = np.moveaxis(normal, -1, 0)
     a, b, c = x * x, y * y, z * z
     second = [x * y, y * z, z * x, a - b, 2 * c - a - b]
@@ -101,4 +100,4 @@ def polynomials(normal: np.ndarray) -> np.ndarray:
         (35 * c * c - 30 * c + 3) / 8,
         (a * a - 6 * a * b + b * b) / 1.5,
     ]
-    return np.stack(second + third + fourth, -1)
+    return np.stack(second + third + fourth)

@@ -20,8 +20,9 @@ from mjx_refine.scene import Shape
 from mjx_refine.view.outline import Arrays, directions, larger, padded, place, support_of, supports
 from mjx_refine.view.points import point_flow
 
-MANY = 128
-"""Directions that tell what is left of corners where outlines shrink, bulge or are hidden."""
+MANY = 64, 128
+"""Directions that effects ask for, so that what is compiled is known: 64 tell what bulges, is worn or is hidden, 128 what is left
+of corners where outlines shrink."""
 
 UNBENDING = 6
 """Steps that undo a lens, each of which leaves a few hundredths of what the last one left."""
@@ -29,7 +30,7 @@ UNBENDING = 6
 
 def directions_for(batch: SceneBatch, count: int) -> int:
     """How many directions, a multiple of ``count``, the effects of ``batch`` need."""
-    return count * -(-MANY // count) if acting.needs_many_directions(batch) else count
+    return count * max(-(-acting.directions_of_outlines(batch) // count), 1)
 
 
 def outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int], count: int):
@@ -76,7 +77,7 @@ def changed_moments(
     if hidden is None:
         wider = change if shift is None else change - (shift * view.normals).sum(-1)
         moved = moved + wider[..., None] * view.normals
-        if change.shape[-1] >= MANY:
+        if change.shape[-1] >= min(MANY):
             slope = (np.roll(wider, -1, -1) - np.roll(wider, 1, -1)) / (4 * np.pi / wider.shape[-1])
             moved = moved + slope[..., None] * np.stack([-view.normals[:, 1], view.normals[:, 0]], -1)
         after = polygon_sums(moved)

@@ -24,9 +24,7 @@ SCENE = Scene((BALL,), Camera((0.0, -2.0, 2.5), 50.0))
 def folder_of(folder, number: str, told: Effect, true: Effect, hidden: dict | None = None) -> None:
     """A clip of ``true`` whose key tells of ``told``."""
     # Flow whose noise is stated is no measured one, which outlines draw along.
-    seen = dataclasses.replace(
-        simulate(dataclasses.replace(SCENE, effects=(true,)), (320, 214), 9), flow_sigma=0.05
-    )
+    seen = dataclasses.replace(simulate(dataclasses.replace(SCENE, effects=(true,)), (320, 214), 9), flow_sigma=0.05)
     (folder / "clips" / number).mkdir(parents=True)
     (folder / "key").mkdir(exist_ok=True)
     save_observation(folder / "clips" / number / "flows.npz", seen)
