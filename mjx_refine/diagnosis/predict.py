@@ -28,6 +28,7 @@ from mjx_refine.view.seen import (
     bent_flow,
     changed_moments,
     directions_for,
+    focal_length,
     outline_function,
     straight_pixels,
 )
@@ -136,7 +137,7 @@ class Predictor:
 
     def _changed(self, reach, contact, facing, scale, whole, batch: SceneBatch, count: int):
         """Reach and moments once effects have changed the outlines of some rows."""
-        focal = (self.image[1] / 2) / np.tan(batch.camera_fovy / 2)
+        focal = focal_length(batch, self.image)
         rate = np.gradient(reach, axis=1) if reach.shape[1] > 1 else np.zeros_like(reach)
         normals = directions(count)
         view = OutlineView(
@@ -188,7 +189,7 @@ class Predictor:
         if not acting.moves_camera(batch):
             return np.zeros((count, frames - 1, len(self.places), 2))
         axes, where = acting.camera_path(batch, frames, self.fps)
-        focal = ((self.image[1] / 2) / np.tan(batch.camera_fovy / 2))[:, None]
+        focal = focal_length(batch, self.image)[:, None]
         x = (self.places[:, 0] - self.image[0] / 2) / focal
         y = -(self.places[:, 1] - self.image[1] / 2) / focal
         ray = np.stack([x, y, -np.ones_like(x)], -1)

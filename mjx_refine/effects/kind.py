@@ -246,11 +246,12 @@ class EffectKind:
 
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         """What is added to the support functions [px], broadcast to (batch, frames, objects, directions)."""
-        return None
+        told = self.moved(view, target, values)
+        return None if told is None else (told * view.normals).sum(-1)
 
     def moved(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
-        """How far points of outlines go (batch, frames, objects, directions, 2) [px], where ``outline`` is their way along the
-        normals; None where it widens outlines instead."""
+        """How far points of outlines go (batch, frames, objects, directions, 2) [px], from which ``outline`` follows; None where
+        it widens outlines instead."""
         return None
 
     def hidden(self, outline: np.ndarray, values: np.ndarray) -> np.ndarray | None:

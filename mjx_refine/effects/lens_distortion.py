@@ -27,6 +27,3 @@ class LensDistortion(EffectKind):
 
     def moved(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
         return self.warp(view.contact, view.focal, view.image, values)
-
-    def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
-        return (self.warp(view.contact, view.focal, view.image, values) * view.normals).sum(-1)

@@ -22,20 +22,11 @@ class RollingShutter(EffectKind):
     parameters = (EffectParameter("readout", "s", 0.012, -0.2, 0.2),)
 
     def moved(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
-        late, velocity = self._late(view, values)
-        return velocity * late[..., None]
-
-    def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:
-        return view.rate * self._late(view, values)[0]
-
-    def _late(self, view: OutlineView, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How much later than its frame each point of an outline is seen [frames], and its velocity [px/frame].
-
-        Along the outline points go as its middle does; a point that goes down the rows meets its own the later.
-        """
+        # Along the outline points go as its middle does; one that goes down the rows meets its own the later.
         middle = 2.0 * (view.rate[..., None] * view.normals).mean(-2, keepdims=True)
         along = middle - (middle * view.normals).sum(-1, keepdims=True) * view.normals
         velocity = view.rate[..., None] * view.normals + along
         a_row = values[:, 0, None, None, None] * view.fps / view.image[1]
         ahead = np.clip(a_row * velocity[..., 1], -FASTEST, FASTEST)
-        return a_row * (view.contact[..., 1] - 0.5 * view.image[1]) / (1.0 - ahead), velocity
+        late = a_row * (view.contact[..., 1] - 0.5 * view.image[1]) / (1.0 - ahead)
+        return velocity * late[..., None]

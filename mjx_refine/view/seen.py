@@ -25,7 +25,7 @@ MANY = 64, 128
 of corners where outlines shrink."""
 
 UNBENDING = 6
-"""Steps that undo a lens, each of which leaves a few hundredths of what the last one left."""
+"""Steps that undo a lens, each of which leaves at most 3 |k1| r^2 of what the last one left (r in focal lengths)."""
 
 
 def directions_for(batch: SceneBatch, count: int) -> int:
@@ -149,8 +149,8 @@ def seen_point_flow(
     seen = acting.apparent(poses, batch, fps)
     if not bends(batch):
         return point_flow(seen, batch, pixels, image)
-    straight, later = straight_pixels(seen, batch, pixels, image, fps)
-    return bent_flow(point_flow(seen, batch, straight, image), later, pixels, batch, image, fps)
+    where, start = straight_pixels(seen, batch, pixels, image, fps)
+    return bent_flow(point_flow(seen, batch, where, image), start, pixels, batch, image, fps)
 
 
 Look: TypeAlias = Callable[
@@ -186,8 +186,8 @@ def straight_pixels(
     image: tuple[int, int],
     fps: float,
 ) -> tuple[Float[np.ndarray, "batch frames objects points 2"], Float[np.ndarray, "batch frames objects points 2"]]:
-    """Where what is seen at ``pixels`` would be without a lens and at its frame's moment [px], and how much more it flows since
-    its row is exposed later [px/frame]: objects go as their centres do.
+    """Where what is seen at ``pixels`` would be without a lens and at its frame's moment [px], and what its flow there is added
+    to for it to end where it is seen next but for the lens [px]: objects go as their centres do.
 
     Args:
       seen: ``apparent`` poses.
@@ -199,26 +199,24 @@ def straight_pixels(
     here = np.broadcast_to(pixels[None], (len(seen), *pixels.shape))
     straight = _unwarped(batch, here, focal_length(batch, image), image)
     if not rolls(batch) or seen.shape[1] < 2:
-        return straight, np.zeros_like(straight)
+        return straight, straight
     velocity = np.gradient(_centres(seen, batch, image), axis=1)[..., None, :]
     gain = np.gradient(velocity, axis=1)
     late = (readout(batch, fps, image) * (here[..., 1] - 0.5 * image[1]))[..., None]
-    return straight - late * (velocity + 0.5 * late * gain), late * gain
+    return straight - late * (velocity + 0.5 * late * gain), straight + late * gain
 
 
 def bent_flow(
     flow: Float[np.ndarray, "batch frames objects points 2"],
-    later: Float[np.ndarray, "batch frames objects points 2"],
+    start: Float[np.ndarray, "batch frames objects points 2"],
     pixels: Float[np.ndarray, "frames objects points 2"],
     batch: SceneBatch,
     image: tuple[int, int],
     fps: float,
 ) -> Float[np.ndarray, "batch frames objects points 2"]:
     """Flow at ``pixels`` as lens and shutter show it [px/frame]; ``flow`` is that without them where ``straight_pixels`` says,
-    and ``later`` what it says of its change."""
-    focal = focal_length(batch, image)
-    straight = _unwarped(batch, np.broadcast_to(pixels[None], flow.shape), focal, image)
-    bent = acting.warped(batch, straight + flow + later, focal, image) - pixels
+    and ``start`` what it says that is added to."""
+    bent = acting.warped(batch, start + flow, focal_length(batch, image), image) - pixels
     return bent if not rolls(batch) else bent * (1 + readout(batch, fps, image) * bent[..., 1])[..., None]
 
 
