@@ -30,6 +30,21 @@ class BatchEffect:
 
 
 @dataclasses.dataclass(frozen=True)
+class Restart:
+    """An object that goes on from a state of its own in every candidate, wherever its path has led it (multiple shooting).
+
+    Attributes:
+      frame: in which it has that state, > 0; of the frames that are shown.
+      target: index of the object.
+      state: position [m], quaternion w x y z, linear velocity (world frame) [m/s] and angular velocity (body frame) [rad/s].
+    """
+
+    frame: int
+    target: int
+    state: Float[np.ndarray, "batch 13"]
+
+
+@dataclasses.dataclass(frozen=True)
 class SceneBatch:
     """B candidates of one scene kind with N objects, float64.
 
@@ -50,6 +65,7 @@ class SceneBatch:
       camera_pitch: rotation about the world's x axis, 0 looks straight down [rad].
       camera_fovy: vertical field of view [rad].
       effects: what the base model lacks, the same kinds for every candidate.
+      restarts: of objects along the way, at the same frames for every candidate; C MuJoCo alone carries them.
     """
 
     shapes: tuple[Shape, ...]
@@ -68,6 +84,7 @@ class SceneBatch:
     camera_pitch: Float[np.ndarray, "batch"]
     camera_fovy: Float[np.ndarray, "batch"]
     effects: tuple[BatchEffect, ...] = ()
+    restarts: tuple[Restart, ...] = ()
 
     def __len__(self) -> int:
         return len(self.mass)
@@ -80,10 +97,11 @@ class SceneBatch:
         """Applies ``function`` to every array."""
         changed = {name: function(getattr(self, name)) for name in ARRAYS}
         effects = tuple(dataclasses.replace(e, values=function(e.values)) for e in self.effects)
-        return dataclasses.replace(self, effects=effects, **changed)
+        restarts = tuple(dataclasses.replace(r, state=function(r.state)) for r in self.restarts)
+        return dataclasses.replace(self, effects=effects, restarts=restarts, **changed)
 
 
-ARRAYS = tuple(f.name for f in dataclasses.fields(SceneBatch) if f.name not in ("shapes", "effects"))
+ARRAYS = tuple(f.name for f in dataclasses.fields(SceneBatch) if f.name not in ("shapes", "effects", "restarts"))
 """The fields that hold one row a candidate."""
 
 
@@ -93,15 +111,21 @@ def concatenate(batches: list[SceneBatch]) -> SceneBatch:
     Raises:
       ValueError: no batch, or the scene kinds differ.
     """
-    kinds = [(b.shapes, [(e.name, e.target) for e in b.effects]) for b in batches]
+    kinds = [
+        (b.shapes, [(e.name, e.target) for e in b.effects], [(r.frame, r.target) for r in b.restarts]) for b in batches
+    ]
     if not batches or any(kind != kinds[0] for kind in kinds):
-        raise ValueError(f"scene kinds {kinds}; expected at least one, all with the same shapes and effects")
+        raise ValueError(f"scene kinds {kinds}; expected at least one, all with the same shapes, effects and restarts")
     arrays = {name: np.concatenate([getattr(batch, name) for batch in batches]) for name in ARRAYS}
     effects = tuple(
         dataclasses.replace(e, values=np.concatenate([b.effects[k].values for b in batches]))
         for k, e in enumerate(batches[0].effects)
     )
-    return SceneBatch(batches[0].shapes, **arrays, effects=effects)
+    restarts = tuple(
+        dataclasses.replace(r, state=np.concatenate([b.restarts[k].state for b in batches]))
+        for k, r in enumerate(batches[0].restarts)
+    )
+    return SceneBatch(batches[0].shapes, **arrays, effects=effects, restarts=restarts)
 
 
 def geom_size(body: Body) -> tuple[float, float, float]:

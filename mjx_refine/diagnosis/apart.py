@@ -13,6 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.sim.model import model_fields
 
+Shot = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+
 
 @dataclasses.dataclass(frozen=True)
 class Beside:
@@ -21,21 +23,27 @@ class Beside:
     Attributes:
       points: the point itself, and then those beside it.
       poses: of the rollouts there.
+      missed: by how much their paths miss the next ones' begin, where there are nodes.
       row: beside which of them each coordinate is moved.
       felt: which objects' residuals each coordinate changes there, and in the last column whether the background's.
     """
 
     points: Float[np.ndarray, "rows dimension"]
     poses: Float[np.ndarray, "rows frames objects 7"]
+    missed: Float[np.ndarray, "rows missed"]
     row: Int[np.ndarray, "dimension"]
     felt: Bool[np.ndarray, "dimension objects_and_background"]
+
+    def change_of_missed(self, owners: Int[np.ndarray, "missed"]) -> Float[np.ndarray, "dimension missed"]:
+        """By how much each coordinate changes what paths miss, which are of the objects ``owners``."""
+        return np.where(self.felt[:, owners], self.missed[self.row] - self.missed[0], 0.0)
 
 
 def beside(
     hypothesis: Hypothesis,
     z: Float[np.ndarray, "dimension"],
     step: Float[np.ndarray, "dimension"],
-    poses_of: Callable[[np.ndarray], np.ndarray],
+    shot: Shot,
 ) -> Beside:
     """Points beside ``z``, by a step along each coordinate; of objects that do not meet in any of them, several at once.
 
@@ -43,28 +51,29 @@ def beside(
       hypothesis: whose coordinates they are.
       z: the point.
       step: of each coordinate.
-      poses_of: rollouts at points, one a row.
+      shot: rollouts at points, one a row, and by how much their paths miss the next ones' begin.
     """
-    still = poses_of(z[None])
+    still, missed = shot(z[None])
     met = _meetings(hypothesis, z[None], still) | hypothesis.couples
     rows = moved_together(hypothesis.owners, companies(met), hypothesis.moves)
-    points, poses = _rolled(hypothesis, z, rows * step, still, poses_of)
+    points, poses, away = _rolled(hypothesis, z, rows * step, (still, missed), shot)
     company = companies(met | _meetings(hypothesis, points, poses))
     if len(rows) < len(z) and (company != companies(met)).any():
         rows = moved_together(hypothesis.owners, np.zeros_like(company), hypothesis.moves)
-        points, poses = _rolled(hypothesis, z, rows * step, still, poses_of)
+        points, poses, away = _rolled(hypothesis, z, rows * step, (still, missed), shot)
     row = rows.argmax(0)
     alone = rows.sum(1)[row] == 1
     felt = alone[:, None] | (company[hypothesis.owners][:, None] == np.append(company, -1))
-    return Beside(np.concatenate([z[None], points]), np.concatenate([still, poses]), 1 + row, felt)
+    both = [np.concatenate(two) for two in ((z[None], points), (still, poses), (missed, away))]
+    return Beside(both[0], both[1], both[2], 1 + row, felt)
 
 
-def _rolled(hypothesis: Hypothesis, z: np.ndarray, steps: np.ndarray, still: np.ndarray, poses_of):
-    points, poses = np.clip(z + steps, *hypothesis.bounds), np.repeat(still, len(steps), 0)
+def _rolled(hypothesis: Hypothesis, z: np.ndarray, steps: np.ndarray, still: tuple[np.ndarray, np.ndarray], shot: Shot):
+    points, (poses, missed) = np.clip(z + steps, *hypothesis.bounds), (np.repeat(s, len(steps), 0) for s in still)
     moves = (steps[:, hypothesis.moves] != 0).any(1)
     if moves.any():
-        poses[moves] = poses_of(points[moves])
-    return points, poses
+        poses[moves], missed[moves] = shot(points[moves])
+    return points, poses, missed
 
 
 def _meetings(hypothesis: Hypothesis, points: np.ndarray, poses: np.ndarray) -> Bool[np.ndarray, "objects objects"]:

@@ -79,7 +79,7 @@ def _of_nothing(clip: ClipFit, base: Fit, fit: Fit) -> Fit:
 
 def alone(clip: ClipFit, fit: Fit, k: int) -> Fit:
     """Effect ``k`` of several by itself, fitted from what they found together."""
-    hypothesis, count = fit.hypothesis, fit.hypothesis.space.dimension
+    hypothesis, count = fit.hypothesis, fit.hypothesis.ground
     ends = count + np.cumsum([int(t.free.sum()) for t in hypothesis.terms])
     own = fit.z[ends[k] - int(hypothesis.terms[k].free.sum()) : ends[k]]
     single = dataclasses.replace(hypothesis, terms=(hypothesis.terms[k],))

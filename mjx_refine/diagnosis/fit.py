@@ -16,10 +16,11 @@ from mjx_refine.diagnosis.drawn_along import always_off
 from mjx_refine.diagnosis.fitted import Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
+from mjx_refine.diagnosis.nodes import missed_by, missing, with_struck
 from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, jagged, settled
 from mjx_refine.diagnosis.pace import STEPS, Standing, descended
 from mjx_refine.diagnosis.predict import Prediction, Predictor
-from mjx_refine.diagnosis.roam import ROAMED, Strategy, looked_around
+from mjx_refine.diagnosis.roam import ROAMED, Strategy, hopped, looked_around
 from mjx_refine.diagnosis.settled import Loose, Settled
 from mjx_refine.diagnosis.slack import PART, Contacts, Impact, Slack, Slacks, contacts, kicked
 from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
@@ -63,8 +64,8 @@ class ClipFit:
     # --- in other processes -----------------------------------------------------------------------------------------
     def again(self) -> Callable[[int], ClipFit]:
         """Makes the clip anew, in whatever process, with so many threads."""
-        shapes, fps = self.simulator.shapes, self.simulator.fps
-        return functools.partial(_made, shapes, fps, self.measured, self.image, self.frames)
+        simulator = self.simulator
+        return functools.partial(_made, simulator.shapes, simulator.fps, self.measured, self.image, self.frames)
 
     @property
     def settled(self) -> Settled:
@@ -128,7 +129,7 @@ class ClipFit:
             return None
         plain = self.poses(*fit.ordinary)[0] if fit.hypothesis.terms else None
         found, long = self._contacts(batch, poses, plain)
-        still = self.predictor(poses[None], batch)
+        found, still = with_struck(found, fit.hypothesis.nodes), self.predictor(poses[None], batch)
         kicks = self.kicks(batch, poses, still, [*found, *long], PART) if found or long else None
         return self._loosened(batch, poses, found, still, kicks), len(found)
 
@@ -144,16 +145,19 @@ class ClipFit:
         """What impacts that err by ``part`` of themselves change in what ``still`` predicts, one standard deviation a row."""
         rows = kicked(self.simulator, batch, poses, found, part)
         self.rollouts += len(rows)
+        for one in batch.restarts:
+            # From there on the object goes on as it does, whatever it was kicked by before.
+            before = np.repeat([i.target == one.target and i.frame < one.frame for i in found], 6)
+            rows[before, one.frame :, one.target] = poses[one.frame :, one.target]
         moved = self.predictor(rows, batch.map(lambda a: np.repeat(a[:1], len(rows), 0)))
         return Parts(*(change[~moved.bad] for change in self._change(moved, still)))
 
     def set_slackness(self, slackness: float) -> None:
         """How much contacts may err, as a multiple of what they may in one clip alone."""
         self.slackness, self._slacks = slackness, Slacks()
-        if self._loose is None:
-            return
-        self.noise = self._loose.blurred(slackness)
-        self._columns = self._loose.columns(slackness, self.rigid)
+        if self._loose is not None:
+            self.noise = self._loose.blurred(slackness)
+            self._columns = self._loose.columns(slackness, self.rigid)
 
     def forget_slack(self, noise: Noise) -> None:
         """Contacts may not err any more."""
@@ -170,8 +174,8 @@ class ClipFit:
 
     def settle_noise(self, fit: Fit, order: int = 2) -> None:
         """Sets the noise to what changes from frame to frame in the residuals of a fit, in differences of this order."""
-        told = self.predictor(self.poses(fit.hypothesis, fit.z[None]), fit.hypothesis.batch(fit.z[None]))
         # As they are: what the robust loss makes of large residuals bends less than they do.
+        told = self.predictor(self.poses(fit.hypothesis, fit.z[None]), fit.hypothesis.batch(fit.z[None]))
         white = self.rigid(self.distances(told), None, 1e9)[0]
         self.measured, self.counts = settled(self.measured, self.measured.split(white), self.counts, order)
         self.noise = everywhere(self.measured, self.frames)
@@ -203,16 +207,16 @@ class ClipFit:
 
     @property
     def slack_columns(self) -> Float[np.ndarray, "residuals columns"]:
-        """What the residuals may err by, one standard deviation a column."""
-        size = sum(part.size for part in self.measured.parts)
-        return np.zeros((size, 0)) if self._columns is None else self._columns
+        """What residuals may err by."""
+        return np.zeros((len(self.measured.objects), 0)) if self._columns is None else self._columns
 
     def kept(self, keep: np.ndarray) -> np.ndarray:
         """Which residuals belong to kept frames."""
-        m = self.measured
-        both = keep[:-1] & keep[1:]
-        parts = [(keep, m.reach), (both, m.flow), (keep, m.moments), (both, m.background)]
-        return np.concatenate([np.repeat(held, array[0].size) for held, array in parts])
+        return self.measured.kept(keep)
+
+    def known(self, fit: Fit) -> Float[np.ndarray, "residuals"]:
+        """A fit's residuals of what was measured, without those of nodes."""
+        return fit.residual[: len(self.measured.objects)]
 
     # --- residuals ------------------------------------------------------------------------------------------------
     def distances(self, prediction: Prediction) -> Parts:
@@ -270,8 +274,8 @@ class ClipFit:
 
     def misfit(self, fit: Fit) -> float:
         """Mean square residual of the objects in noise widths."""
-        objects = len(fit.residual) - self.measured.background.size
-        return float((fit.residual[:objects] ** 2).sum()) / self.expected(beside=False)
+        seen = self.known(fit)[: self.measured.objects.size - self.measured.background.size]
+        return float((seen**2).sum()) / self.expected(beside=False)
 
     def rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
         """The simulator's, counted."""
@@ -280,27 +284,44 @@ class ClipFit:
 
     def poses(self, hypothesis: Hypothesis, z: np.ndarray, keep: np.ndarray | None = None) -> np.ndarray:
         """Rollouts at the rows of ``z``; after what is kept, all stands still."""
+        return self.shot(hypothesis, z, keep)[0]
+
+    def shot(
+        self, hypothesis: Hypothesis, z: np.ndarray, keep: np.ndarray | None = None
+    ) -> tuple[Float[np.ndarray, "batch frames objects 7"], Float[np.ndarray, "batch missed"]]:
+        """As ``poses``, and by how much paths miss the begin of those after nodes [deviations]."""
         needed = self.frames if keep is None else min(int(np.flatnonzero(keep)[-1]) + 2, self.frames)
-        told = self.rollout(hypothesis.batch(z), needed)
-        return np.concatenate([told, np.repeat(told[:, -1:], self.frames - needed, 1)], 1)
+        told, missed = self.shot_of(hypothesis, hypothesis.batch(z), needed)
+        return np.concatenate([told, np.repeat(told[:, -1:], self.frames - needed, 1)], 1), missed
+
+    def shot_of(
+        self, hypothesis: Hypothesis, batch: SceneBatch, frames: int
+    ) -> tuple[Float[np.ndarray, "batch frames objects 7"], Float[np.ndarray, "batch missed"]]:
+        """The same of candidates, and of so many frames."""
+        if not hypothesis.nodes:
+            return self.rollout(batch, frames), np.zeros((len(batch), 0))
+        self.rollouts += len(batch) * frames / self.frames
+        poses, arrived = self.simulator.shot(batch, frames)  # type: ignore[attr-defined]
+        return poses, missed_by(hypothesis.nodes, arrived, batch.restarts)
 
     def residuals(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE):
         """(residuals (B, R), half their sum of squares with the prior (B,))."""
-        prediction = self.predictor(self.poses(hypothesis, z, keep), hypothesis.batch(z))
-        white = self.whitened(self.distances(prediction), keep, scale, hypothesis)
+        poses, missed = self.shot(hypothesis, z, keep)
+        prediction = self.predictor(poses, hypothesis.batch(z))
+        white = np.concatenate([self.whitened(self.distances(prediction), keep, scale, hypothesis), missed], 1)
         cost = 0.5 * (white**2).sum(1) + 0.5 * (prior(hypothesis, z)[0] ** 2).sum(1)
         return white, np.where(prediction.bad, np.inf, cost)
 
     def jacobian(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE, size=STEPS[0]):
         """d residuals / d z (R, D) by differences towards the inside of the bounds."""
         step = np.where(z + size > hypothesis.bounds[1], -size, size)
-        told = beside(hypothesis, z, step, functools.partial(self.poses, hypothesis, keep=keep))
+        told = beside(hypothesis, z, step, functools.partial(self.shot, hypothesis, keep=keep))
         prediction = self.predictor(told.poses, hypothesis.batch(told.points))
         white = self.rigid(self.distances(prediction), keep, scale)
-        change = np.where(prediction.bad[told.row, None], 0.0, white[told.row] - white[0])
-        change = np.where(told.felt[:, self.measured.objects], change, 0.0)
+        change = np.where(told.felt[:, self.measured.objects], white[told.row] - white[0], 0.0)
         slack = self._slack(keep, hypothesis)
-        return ((change if slack is None else slack(change)) / step[:, None]).T
+        change = np.where(prediction.bad[told.row, None], 0.0, change if slack is None else slack(change))
+        return (np.concatenate([change, told.change_of_missed(missing(hypothesis.nodes))], 1) / step[:, None]).T
 
     # --- least squares --------------------------------------------------------------------------------------------
     @remembered
@@ -343,24 +364,9 @@ class ClipFit:
 
     @remembered
     def hop(self, fit: Fit, seed: int, rounds: int = 3, count: int = 64, keep=None, scale: float = SCALE) -> Fit:
-        """Least squares again from better points around its end: draws from the fit's own posterior at several widths.
-
-        After contacts the residuals are jagged, and derivatives see only the nearest step.
-        """
-        generator = np.random.default_rng(seed)
-        for _ in range(rounds):
-            factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
-            width = np.geomspace(0.3, 8.0, count)[:, None]
-            draws = generator.standard_normal((count, len(fit.z))) @ factor * width
-            points = np.clip(fit.z + draws, *fit.hypothesis.bounds)
-            _, costs = self.residuals(fit.hypothesis, points, keep, scale)
-            best = np.argsort(costs)[:1]
-            if not costs[best[0]] < fit.cost + 0.1 * abs(fit.cost):
-                continue
-            trial = self.fit(fit.hypothesis, points[best[0]], 6, keep, scale)
-            if trial.cost < fit.cost:
-                fit = trial
-        return fit
+        """Least squares again from better points around its end (``hopped``)."""
+        told = functools.partial(self.residuals, fit.hypothesis, keep=keep, scale=scale)
+        return hopped(fit, seed, rounds, count, told, lambda z: self.fit(fit.hypothesis, z, 6, keep, scale))
 
     @remembered
     def roam(self, fit: Fit, seed: int, widths: tuple[float, ...] = ROAMED) -> Fit:
@@ -380,7 +386,7 @@ class ClipFit:
         cost = data + 0.5 * float(price_of_z @ price_of_z)
         logdet = float(np.linalg.slogdet(jacobian.T @ jacobian + np.diag(slope**2))[1])
         slack = self._slack(keep, hypothesis)
-        price = sum(np.log(t.places) for t in hypothesis.terms) + (slack.price if slack else 0.0)
+        price = hypothesis.price + (slack.price if slack else 0.0)
         return Fit(hypothesis, z, cost, data, jacobian, base, -cost - 0.5 * logdet - price, ended)
 
     def at(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE) -> Fit:

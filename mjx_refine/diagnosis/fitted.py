@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.nodes import HELD
 from mjx_refine.search.residuals import slowed
 
 
@@ -74,5 +75,7 @@ def prior(hypothesis: Hypothesis, z: Float[np.ndarray, "*batch dimension"]) -> t
     heavy = np.isfinite(tails)
     tail = np.where(heavy, tails, 1.0)
     residual = np.where(heavy, slowed(z, tail), z)
+    loose = hypothesis.loose
     slope = np.where(np.abs(z) > 1e-6, np.abs(z) / np.maximum((1 + (z / tail) ** 2) * np.abs(residual), 1e-12), 1.0)
-    return residual, np.where(heavy, np.maximum(slope, 0.1), 1.0)
+    slope = np.where(heavy, np.maximum(slope, 0.1), 1.0)
+    return np.where(loose, HELD * z, residual), np.where(loose, HELD, slope)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mjx_refine.batch import BatchEffect, SceneBatch, scene_from_batch
+from mjx_refine.diagnosis.nodes import COORDINATES, Node
 from mjx_refine.effects import EffectKind, acting_kind, effect_entry
 from mjx_refine.effects.acting import on_the_floor
 from mjx_refine.scene import Effect, Scene
@@ -21,6 +22,10 @@ tails let size, camera and velocity bend until they imitate an effect."""
 CONTACTS, CONTACT_TAIL, ROLLING_TAIL = ("friction", "resistance", "grip"), 2.0, 5.0
 """Fields that mean something else in every engine, and on every real floor, and their tail; that of rolling friction is farther
 off: with numbers 19 and 29 widths off two cylinders that met obstacles (seed 18, 039 and 043) were stopped by the floor."""
+
+
+FARTHEST = 60.0
+"""Bounds of nodes' coordinates, in their units."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,21 +85,29 @@ class Hypothesis:
       terms: the effects at work.
       slack: what contacts along a path of this hypothesis may err by, one standard deviation a column [noise widths]; None:
         what the clip's may.
+      nodes: where objects go on from states of their own, which are ordinary numbers too, after the base model's.
     """
 
     space: Space
     terms: tuple[Term, ...] = ()
     slack: Float[np.ndarray, "residuals columns"] | None = None
+    nodes: tuple[Node, ...] = ()
 
     @property
     def dimension(self) -> int:
-        return self.space.dimension + sum(int(t.free.sum()) for t in self.terms)
+        return self.ground + sum(int(t.free.sum()) for t in self.terms)
+
+    @property
+    def ground(self) -> int:
+        """How many coordinates are ordinary: those of the base model and of nodes, which come before the effects'."""
+        return self.space.dimension + COORDINATES * len(self.nodes)
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of z."""
-        lows = [-self.space.start / self.space.sigma]
-        highs = [(1.0 - self.space.start) / self.space.sigma]
+        far = np.full(COORDINATES * len(self.nodes), FARTHEST)
+        lows = [-self.space.start / self.space.sigma, -far]
+        highs = [(1.0 - self.space.start) / self.space.sigma, far]
         for t in self.terms:
             lows.append(((t.low - t.centre) / t.width)[t.free])
             highs.append(((t.high - t.centre) / t.width)[t.free])
@@ -103,7 +116,13 @@ class Hypothesis:
     @property
     def ordinary(self) -> Bool[np.ndarray, "dimension"]:
         """Which coordinates are the base model's."""
-        return np.arange(self.dimension) < self.space.dimension
+        return np.arange(self.dimension) < self.ground
+
+    @property
+    def loose(self) -> Bool[np.ndarray, "dimension"]:
+        """Which coordinates are of nodes, which no prior holds."""
+        place = np.arange(self.dimension)
+        return (place >= self.space.dimension) & (place < self.ground)
 
     @property
     def rigid(self) -> Hypothesis:
@@ -128,6 +147,7 @@ class Hypothesis:
     def moves(self) -> Bool[np.ndarray, "dimension"]:
         """Which coordinates change the rollout, and not just how it is seen."""
         parts = [np.array([not p.field.startswith("camera") for p in self.space.parameters], bool)]
+        parts.append(np.ones(COORDINATES * len(self.nodes), bool))
         for t in self.terms:
             acts = t.kind.physical or t.kind.retimes
             parts.append(np.full(int(t.free.sum()), acts))
@@ -136,8 +156,13 @@ class Hypothesis:
     @property
     def owners(self) -> Int[np.ndarray, "dimension"]:
         """The object that each coordinate is of, -1 where it is of none alone."""
-        told = [p.index[0] for p in self.space.parameters]
+        told = [p.index[0] for p in self.space.parameters] + [n.target for n in self.nodes for _ in range(COORDINATES)]
         return np.array(told + [t.target for t in self.terms for _ in range(int(t.free.sum()))], int)
+
+    @property
+    def price(self) -> float:
+        """What places and moments that were looked through, and what paths may miss, cost in evidence."""
+        return sum(float(np.log(t.places)) for t in self.terms) + sum(n.price for n in self.nodes)
 
     @property
     def strikes(self) -> bool:
@@ -151,7 +176,7 @@ class Hypothesis:
 
     def values(self, z: Float[np.ndarray, "batch dimension"], k: int) -> Float[np.ndarray, "batch parameters"]:
         """The numbers of term ``k``."""
-        start = self.space.dimension + sum(int(t.free.sum()) for t in self.terms[:k])
+        start = self.ground + sum(int(t.free.sum()) for t in self.terms[:k])
         t = self.terms[k]
         result = np.repeat(t.centre[None], len(z), 0)
         part = z[:, start : start + int(t.free.sum())]
@@ -166,7 +191,13 @@ class Hypothesis:
     def batch_with(self, z: Float[np.ndarray, "batch dimension"], effects: tuple[BatchEffect, ...]) -> SceneBatch:
         """The candidates at ``z`` with other effects than the terms'; a tilted floor carries its objects along."""
         u = np.clip(self.space.start + z[:, : self.space.dimension] * self.space.sigma, 0.0, 1.0)
-        return on_the_floor(dataclasses.replace(self.space.decode(u), effects=effects))
+        batch = on_the_floor(dataclasses.replace(self.space.decode(u), effects=effects))
+        if not self.nodes:
+            return batch
+        own = np.split(z[:, self.space.dimension : self.ground], len(self.nodes), 1)
+        return dataclasses.replace(
+            batch, restarts=tuple(n.restart(part) for n, part in zip(self.nodes, own, strict=True))
+        )
 
     def scene(self, z: Float[np.ndarray, "dimension"], frames: int) -> Scene:
         """The scene at ``z``, with its effects as entries."""

@@ -9,7 +9,7 @@ import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from mjx_refine.diagnosis.gaps import gap_between
@@ -138,10 +138,16 @@ class Measured:
         reach = np.where(np.isnan(told.reach), np.nan, self.reach)
         return dataclasses.replace(self, reach=reach, moments=np.where(np.isnan(told.moments), np.nan, self.moments))
 
+    def kept(self, keep: Bool[np.ndarray, "frames"]) -> Bool[np.ndarray, "residuals"]:
+        """Which numbers of ``Parts.flat`` belong to kept frames."""
+        both = keep[:-1] & keep[1:]
+        parts = [(keep, self.reach), (both, self.flow), (keep, self.moments), (both, self.background)]
+        return np.concatenate([np.repeat(held, array[0].size) for held, array in parts])
+
     def split(self, row: Float[np.ndarray, "residuals"]) -> Parts:
-        """A row of ``Parts.flat`` in its parts again."""
-        ends = np.cumsum([part.size for part in self.parts])[:-1]
-        pieces = np.split(row, ends)
+        """A row of ``Parts.flat`` in its parts again; what comes after them is left out."""
+        ends = np.cumsum([part.size for part in self.parts])
+        pieces = np.split(row, ends)[:-1]
         return Parts(*(piece.reshape(part.shape) for piece, part in zip(pieces, self.parts, strict=True)))
 
 

@@ -19,7 +19,7 @@ def values_at(clip: ClipFit, fit: Fit, k: int) -> dict[str, Value]:
     """Parameters of one effect with 90 % intervals from the curvature, widened where the fit leaves more than noise."""
     hypothesis = fit.hypothesis
     covariance = np.linalg.inv(fit.curvature) * max(1.0, clip.misfit(fit))
-    first = hypothesis.space.dimension + sum(int(o.free.sum()) for o in hypothesis.terms[:k])
+    first = hypothesis.ground + sum(int(o.free.sum()) for o in hypothesis.terms[:k])
     values = hypothesis.values(fit.z[None], k)[0]
     return values_of(hypothesis.terms[k], values, np.sqrt(np.diag(covariance))[first:], clip.frames)
 
@@ -61,7 +61,7 @@ def tied(fit: Fit) -> list[str]:
     """Sentences about numbers of one effect that do each other's work."""
     covariance = np.linalg.inv(fit.curvature)
     correlation = covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
-    first, told = fit.hypothesis.space.dimension, []
+    first, told = fit.hypothesis.ground, []
     for t in fit.hypothesis.terms:
         free = np.nonzero(t.free)[0]
         names = [p.name for p in t.kind.parameters]

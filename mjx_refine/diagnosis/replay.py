@@ -75,4 +75,4 @@ def _held(fit: Fit) -> tuple[Hypothesis, Float[np.ndarray, "dimension"]]:
     """The fit's hypothesis with its effects held at their values and contacts as a scene file has them, and its point."""
     terms = tuple(_fixed(t, fit.hypothesis.values(fit.z[None], k)[0]) for k, t in enumerate(fit.hypothesis.terms))
     space, stay = without_grips(fit.hypothesis.space)
-    return dataclasses.replace(fit.hypothesis, space=space, terms=terms, slack=None), fit.z[: len(stay)][stay]
+    return dataclasses.replace(fit.hypothesis, space=space, terms=terms, slack=None, nodes=()), fit.z[: len(stay)][stay]

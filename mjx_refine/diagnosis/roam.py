@@ -79,3 +79,37 @@ def looked_around(
             best, point = float(np.min(costs)), points[int(np.argmin(costs))]
         strategy.tell(costs)
     return best, point
+
+
+def hopped(
+    fit: Fit,
+    seed: int,
+    rounds: int,
+    count: int,
+    residuals: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+    fitted: Callable[[np.ndarray], Fit],
+) -> Fit:
+    """Least squares again from better points around a fit's end: draws from its own posterior at several widths.
+
+    After contacts the residuals are jagged, and derivatives see only the nearest step.
+
+    Args:
+      fit: where least squares ended.
+      seed: of the draws.
+      rounds: how often.
+      count: of draws a round.
+      residuals: of points, one a row, and their costs.
+      fitted: least squares from a point.
+    """
+    generator = np.random.default_rng(seed)
+    for _ in range(rounds):
+        factor = np.linalg.inv(np.linalg.cholesky(fit.curvature))
+        width = np.geomspace(0.3, 8.0, count)[:, None]
+        draws = generator.standard_normal((count, len(fit.z))) @ factor * width
+        points = np.clip(fit.z + draws, *fit.hypothesis.bounds)
+        _, costs = residuals(points)
+        best = int(np.argsort(costs)[0])
+        if costs[best] < fit.cost + 0.1 * abs(fit.cost):
+            trial = fitted(points[best])
+            fit = trial if trial.cost < fit.cost else fit
+    return fit

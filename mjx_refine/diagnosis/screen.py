@@ -150,13 +150,13 @@ class Screen:
         # A slope carries its objects along; its batch must be made with its values.
         batch = hypothesis.batch_with(z, effects)
         if acts:
-            self.clip.rollouts += len(z)
-            poses = self.clip.simulator.rollout(batch, self.clip.frames)
+            poses, missed = self.clip.shot_of(hypothesis, batch, self.clip.frames)
         else:
             poses = np.repeat(self.poses, len(z), 0)
+            missed = np.repeat(self.fit.residual[None, len(self.clip.known(self.fit)) :], len(z), 0)
         prediction = self.clip.predictor(poses, batch)
         white = self.clip.whitened(self.clip.distances(prediction), None, self.scale, self.fit.hypothesis)
-        return np.where(prediction.bad[:, None], 1e3, white)
+        return np.where(prediction.bad[:, None], 1e3, np.concatenate([white, missed], 1))
 
     def _lead(self, kind: EffectKind, target: int, start: Start, white: np.ndarray) -> Lead:
         fit, price = self.fit, float(np.log(start.places))

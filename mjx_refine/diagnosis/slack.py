@@ -321,7 +321,7 @@ def states(simulator: Simulator, batch: SceneBatch, poses: np.ndarray) -> tuple[
 
 def _restarted(batch: SceneBatch, pose: np.ndarray, velocity: np.ndarray, spin: np.ndarray, count: int) -> SceneBatch:
     # Frames are counted from here on.
-    many = acting.untimed(batch).map(lambda a: np.repeat(a[:1], count, 0))
+    many = acting.untimed(dataclasses.replace(batch, restarts=())).map(lambda a: np.repeat(a[:1], count, 0))
     quaternion = np.repeat(pose[None, :, 3:], count, 0)
     return dataclasses.replace(
         many,

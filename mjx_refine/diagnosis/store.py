@@ -123,6 +123,8 @@ def _tokens(part: object) -> Iterable[bytes]:
     elif isinstance(part, Hypothesis):
         yield repr(part.space).encode()
         yield from _tokens(part.slack)
+        for n in part.nodes:
+            yield from _tokens((n.target, n.frame, n.state, n.sigma))
         for t in part.terms:
             yield from _tokens((t.name, t.target, t.centre, t.width, t.low, t.high, t.free, t.places, t.excused))
     elif isinstance(told := getattr(part, "parts", None), tuple):

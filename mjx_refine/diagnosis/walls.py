@@ -46,7 +46,7 @@ def push_last(fit: Fit) -> Fit:
     """The fit with a push as its last effect; its derivatives are not to be used."""
     hypothesis = fit.hypothesis
     order = sorted(range(len(hypothesis.terms)), key=lambda k: hypothesis.terms[k].name == "push")
-    counts = [hypothesis.space.dimension, *(int(t.free.sum()) for t in hypothesis.terms)]
+    counts = [hypothesis.ground, *(int(t.free.sum()) for t in hypothesis.terms)]
     base, *own = np.split(fit.z, np.cumsum(counts)[:-1])
     terms = tuple(hypothesis.terms[k] for k in order)
     return dataclasses.replace(

@@ -162,6 +162,7 @@ def turned_state(batch: SceneBatch, turn: Float[np.ndarray, "batch 3 3"]) -> Sce
     def vector(v: np.ndarray) -> np.ndarray:
         return np.einsum("bij,b...j->b...i", turn, v)
 
+    restarts = tuple(dataclasses.replace(r, state=turned_states(r.state[:, None], turn)[:, 0]) for r in batch.restarts)
     return dataclasses.replace(
         batch,
         position=vector(batch.position),
@@ -170,6 +171,23 @@ def turned_state(batch: SceneBatch, turn: Float[np.ndarray, "batch 3 3"]) -> Sce
         ),
         linear_velocity=vector(batch.linear_velocity),
         gravity=vector(batch.gravity),
+        restarts=restarts,
+    )
+
+
+def turned_states(
+    states: Float[np.ndarray, "batch restarts 13"], turn: Float[np.ndarray, "batch 3 3"]
+) -> Float[np.ndarray, "batch restarts 13"]:
+    """States (``Restart.state``) in axes turned by ``turn``."""
+    quaternion = np.broadcast_to(quaternion_of(turn)[:, None], (*states.shape[:2], 4))
+    return np.concatenate(
+        [
+            np.einsum("bij,bkj->bki", turn, states[..., :3]),
+            rotations.multiply(quaternion, states[..., 3:7]),
+            np.einsum("bij,bkj->bki", turn, states[..., 7:10]),
+            states[..., 10:],
+        ],
+        -1,
     )
 
 

@@ -17,6 +17,7 @@ from mjx_refine.sim import cores
 from mjx_refine.sim.buckets import diverged_to_nan
 from mjx_refine.sim.carried import carried
 from mjx_refine.sim.model import IDLE, SUBSTEPS, Edited, build_spec, field_arrays, initial_state, model_fields
+from mjx_refine.sim.restarts import Restarts
 from mjx_refine.sim.stepped import A_STEP, stepped_rollout
 
 # MuJoCo's default handler appends to MUJOCO_LOG.TXT in the working directory. A candidate that diverges is no news.
@@ -93,11 +94,23 @@ class MujocoSimulator:
 
         With effects that act on motion and timing; those on the view are ``effects.acting.apparent``'s.
         """
-        if batch.effects:
-            return self._rollout_with_effects(batch, frames)
-        return self._finished(self._positions(batch, frames, None), batch, frames)
+        return self.shot(batch, frames)[0]
 
-    def _positions(self, batch: SceneBatch, frames: int, world: np.ndarray | None) -> np.ndarray:
+    def shot(
+        self, batch: SceneBatch, frames: int
+    ) -> tuple[Float[np.ndarray, "batch frames objects 7"], Float[np.ndarray, "batch restarts 13"]]:
+        """As ``rollout``, and the states in which objects arrive where they restart; NaN where that is later."""
+        arrived = np.full((len(batch), len(batch.restarts), 13), np.nan)
+
+        def inner(inside: SceneBatch, needed: int, world: np.ndarray | None) -> np.ndarray:
+            restarts = Restarts(inside, len(self.shapes), needed)
+            positions = self._positions(inside, needed, world, restarts)
+            arrived[:] = restarts.arrived if world is None else acting.turned_states(restarts.arrived, world)
+            return self._finished(positions, inside, needed)
+
+        return (carried(batch, frames, inner) if batch.effects else inner(batch, frames, None)), arrived
+
+    def _positions(self, batch: SceneBatch, frames: int, world: np.ndarray | None, restarts: Restarts) -> np.ndarray:
         """``qpos`` in every frame, (batch, frames, 7 N)."""
         models, data = self._prepared(batch)
         qpos, qvel = initial_state(batch)
@@ -108,19 +121,20 @@ class MujocoSimulator:
         state = np.zeros((len(batch), size))
         state[:, 1 : 1 + qpos.shape[1] + qvel.shape[1]] = np.concatenate([qpos, qvel], 1)
         if batch.effects and acting.has_loads(batch):
-            later = stepped_rollout(self._workers_for, models, data, state, batch, frames, world)
-        else:
-            steps = (frames - 1) * SUBSTEPS
+            later = stepped_rollout(self._workers_for, models, data, state, batch, frames, world, restarts)
+            return np.concatenate([first, later], 1)
+        parts, frame = [first], 0
+        while frame < frames - 1:
+            until = restarts.after(frame, frames - 1)
+            steps = (until - frame) * SUBSTEPS
             workers = self._workers_for(steps * len(batch) * A_STEP)
-            states, _ = workers.rollout(models, data[: workers.nthread or 1], state, nstep=steps)
-            later = np.asarray(states)[:, SUBSTEPS - 1 :: SUBSTEPS, 1 : 1 + qpos.shape[1]]
-        return np.concatenate([first, later], 1)
-
-    def _rollout_with_effects(self, batch: SceneBatch, frames: int) -> np.ndarray:
-        def inner(inside: SceneBatch, needed: int, world: np.ndarray | None) -> np.ndarray:
-            return self._finished(self._positions(inside, needed, world), inside, needed)
-
-        return carried(batch, frames, inner)
+            states = np.asarray(workers.rollout(models, data[: workers.nthread or 1], state, nstep=steps)[0])
+            shown = states[:, SUBSTEPS - 1 :: SUBSTEPS]
+            state, frame = shown[:, -1].copy(), until
+            if restarts.begin(frame, state):
+                shown = np.concatenate([shown[:, :-1], state[:, None]], 1)
+            parts.append(shown[..., 1 : 1 + qpos.shape[1]])
+        return np.concatenate(parts, 1)
 
     def _finished(self, positions: np.ndarray, batch: SceneBatch, frames: int) -> np.ndarray:
         return diverged_to_nan(positions.reshape(len(batch), frames, len(self.shapes), 7))

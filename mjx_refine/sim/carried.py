@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -25,6 +26,9 @@ def carried(batch: SceneBatch, frames: int, inner: Inner) -> Float[np.ndarray, "
     """
     shown = acting.shown_frames(batch, frames)
     needed = frames if shown is None else int(shown.max()) + 1
+    if shown is not None and batch.restarts:
+        restarts = (dataclasses.replace(r, frame=int(shown[0, min(r.frame, frames - 1)])) for r in batch.restarts)
+        batch = dataclasses.replace(batch, restarts=tuple(restarts))
     world = acting.floor_rotation(batch)
     poses = inner(batch if world is None else acting.turned_state(batch, np.swapaxes(world, -1, -2)), needed, world)
     if world is not None:
@@ -40,6 +44,8 @@ def refuse_loads(batch: SceneBatch, backend: str) -> None:
     Raises:
       InputError: the batch has such an effect.
     """
+    if batch.restarts:
+        raise ValueError(f"backend {backend} restarts no objects; expected C MuJoCo")
     lacking = acting.with_loads(batch)
     if lacking:
         raise InputError(f"effect {lacking[0]}: backend {backend} cannot carry it; use --backend mujoco")

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mjx_refine.batch import SceneBatch
+from mjx_refine.batch import BatchEffect, SceneBatch
 from mjx_refine.effects.registry import acting_kind
 from mjx_refine.sim.backends import Simulator
 
@@ -105,8 +105,9 @@ class Recalling:
 
     def rollout(self, batch: SceneBatch, frames: int) -> Float[np.ndarray, "batch frames objects 7"]:
         """As the simulator's; not to be written to."""
-        acting = tuple(e for e in batch.effects if (kind := acting_kind(e.name)).physical or kind.retimes)
-        moving = dataclasses.replace(batch, effects=acting)
+        if batch.restarts:
+            return self.shot(batch, frames)[0]
+        moving = dataclasses.replace(batch, effects=_moving(batch))
         key = self._key(moving, frames)
         found = self.memory.recall(key)
         if found is not None:
@@ -115,6 +116,19 @@ class Recalling:
         poses = self.simulator.rollout(moving, frames)
         self.memory.keep(key, poses)
         return poses
+
+    def shot(self, batch: SceneBatch, frames: int) -> tuple[np.ndarray, np.ndarray]:
+        """As the simulator's; not to be written to."""
+        moving = dataclasses.replace(batch, effects=_moving(batch))
+        key, count = self._key(moving, frames), len(batch.restarts)
+        found = self.memory.recall(key)
+        self.recalled += found is not None
+        if found is None:
+            poses, arrived = self.simulator.shot(moving, frames)
+            found = np.concatenate([poses.reshape(len(batch), -1), arrived.reshape(len(batch), -1)], 1)
+            self.memory.keep(key, found)
+        poses, arrived = np.split(found, [found.shape[1] - 13 * count], 1)
+        return poses.reshape(len(batch), frames, -1, 7), arrived.reshape(len(batch), count, 13)
 
     def _key(self, batch: SceneBatch, frames: int) -> str:
         """A fingerprint of all that a rollout depends on."""
@@ -126,6 +140,11 @@ class Recalling:
         return state.hexdigest()
 
 
+def _moving(batch: SceneBatch) -> tuple[BatchEffect, ...]:
+    """The effects that change a rollout."""
+    return tuple(e for e in batch.effects if (kind := acting_kind(e.name)).physical or kind.retimes)
+
+
 def _parts(batch: SceneBatch) -> Iterator[bytes]:
     yield repr(batch.shapes).encode()
     for field in dataclasses.fields(batch):
@@ -135,3 +154,6 @@ def _parts(batch: SceneBatch) -> Iterator[bytes]:
     for effect in batch.effects:
         yield f"{effect.name} {effect.target} {effect.values.shape}".encode()
         yield np.ascontiguousarray(effect.values).tobytes()
+    for one in batch.restarts:
+        yield f"{one.frame} {one.target}".encode()
+        yield np.ascontiguousarray(one.state).tobytes()

@@ -15,6 +15,7 @@ from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting
 from mjx_refine.effects.kind import Loads, Motion
 from mjx_refine.sim.model import SUBSTEPS
+from mjx_refine.sim.restarts import Restarts
 
 A_STEP = 2e-6
 """What one step of one candidate takes at least [s]: in the air; one on the floor takes 20 us."""
@@ -30,6 +31,7 @@ def stepped_rollout(
     batch: SceneBatch,
     frames: int,
     world: Float[np.ndarray, "batch 3 3"] | None,
+    restarts: Restarts,
 ) -> Float[np.ndarray, "batch intervals positions"]:
     """``qpos`` at the start of frames 1, 2, ... under the loads of the batch's effects.
 
@@ -44,6 +46,7 @@ def stepped_rollout(
       batch: the candidates with their effects, in the floor's axes.
       frames: of the clip.
       world: floor to world, where they differ: effects think in the world's axes.
+      restarts: of objects along the way.
     """
     count, objects = batch.mass.shape
     positions, step = 7 * objects, models[0].opt.timestep
@@ -56,7 +59,8 @@ def stepped_rollout(
     while k < last:
         motion = _motion(state, batch, k * step, step, world)
         idle = acting.idle(batch, motion)
-        steps = 1 if np.isnan(idle) else int(np.clip(min(idle, 1e3) // step, 1, last - k))
+        most = SUBSTEPS * restarts.after(k // SUBSTEPS, frames - 1) - k
+        steps = 1 if np.isnan(idle) else int(np.clip(min(idle, 1e3) // step, 1, most))
         told = acting.loads(batch, motion)
         if centre is not None and told is not None:
             told = _about_the_mass(told, motion, centre)
@@ -88,6 +92,8 @@ def stepped_rollout(
         ends = np.arange(-(-(k + 1) // SUBSTEPS) * SUBSTEPS, k + steps + 1, SUBSTEPS)
         result[:, ends // SUBSTEPS - 1] = states[:, ends - k - 1, 1 : 1 + positions]
         state, k = states[:, -1].copy(), k + steps
+        if k % SUBSTEPS == 0 and restarts.begin(k // SUBSTEPS, state):
+            result[:, k // SUBSTEPS - 1] = state[:, 1 : 1 + positions]
     for row, model in enumerate(models):
         model.pair_friction[:objects, :2] = usual[row, :, None]
     return result

@@ -14,8 +14,8 @@ from mjx_refine.diagnosis.fit import SCALE, ClipFit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.leads import beginning
 from mjx_refine.diagnosis.screen import AWAY, Screen
-from mjx_refine.diagnosis.search import _keep_leads
 from mjx_refine.diagnosis.shown import view_of
+from mjx_refine.diagnosis.singles import _keep_leads
 from mjx_refine.effects import catalogue
 from mjx_refine.scene import Effect
 

@@ -237,7 +237,7 @@ def test_effects_that_ended_behind_the_base_model_stand_at_no_size():
 def test_numbers_of_an_effect_that_do_each_others_work_are_told(likeness, told):
     drag = term("drag", 0, 10)
     hypothesis = SimpleNamespace(
-        space=SimpleNamespace(dimension=1), terms=(drag,), tails=np.array([6.0, np.inf, np.inf])
+        ground=1, terms=(drag,), tails=np.array([6.0, np.inf, np.inf]), loose=np.zeros(3, bool)
     )
     across = np.sqrt(1 - likeness**2)
     jacobian = 50 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, likeness], [0.0, 0.0, across]])

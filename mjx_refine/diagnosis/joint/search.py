@@ -16,7 +16,7 @@ from mjx_refine.diagnosis.joint.slack import set_slackness, with_slackness
 from mjx_refine.diagnosis.leads import FORGIVING, chosen_of
 from mjx_refine.diagnosis.pairs import PROMISE_OF_PAIRS, SECOND_PROMISE
 from mjx_refine.diagnosis.screen import Lead
-from mjx_refine.diagnosis.search import target_name
+from mjx_refine.diagnosis.singles import target_name
 from mjx_refine.diagnosis.tempered import Told
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
