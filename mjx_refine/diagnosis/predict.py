@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -123,7 +124,7 @@ class Predictor:
         if count:
             # Of a few rows at a time, which a core's cache holds, arrays in many directions take half as long.
             rows = [slice(first, first + CACHED) for first in range(0, len(seen), CACHED)]
-            changed = [self._changed(*(part[one] for part in (*told, whole)), batch[one], count) for one in rows]
+            changed = [self._changed([part[one] for part in (*told, whole)], batch[one], count) for one in rows]
             reach, whole = (np.concatenate(part) for part in zip(*changed, strict=True))
         if self.drawn:
             flow = drawn_along(flow, whole)
@@ -135,8 +136,9 @@ class Predictor:
             flow = flow + beside[..., None] * (around - flow)
         return Prediction(reach, flow, whole, background, bad)
 
-    def _changed(self, reach, contact, facing, scale, whole, batch: SceneBatch, count: int):
+    def _changed(self, told: Sequence[np.ndarray], batch: SceneBatch, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Reach and moments once effects have changed the outlines of some rows."""
+        reach, contact, facing, scale, whole = told
         focal = focal_length(batch, self.image)
         rate = np.gradient(reach, axis=1) if reach.shape[1] > 1 else np.zeros_like(reach)
         normals = directions(count)

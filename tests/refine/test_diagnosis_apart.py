@@ -67,12 +67,12 @@ def test_rollouts_are_shared_only_where_objects_do_not_meet(distance, fewer):
     hypothesis = Hypothesis(Space.around(one)).added(term("magnus", 0, 12))
     simulator, asked = MujocoSimulator(one.shapes, 30.0, 1), []
 
-    def poses_of(points):
+    def shot(points):
         asked.append(len(points))
-        return simulator.rollout(hypothesis.batch(points), 12)
+        return simulator.rollout(hypothesis.batch(points), 12), np.zeros((len(points), 0))
 
     z, step = np.zeros(hypothesis.dimension), np.full(hypothesis.dimension, 0.01)
-    told = beside(hypothesis, z, step, poses_of)
+    told = beside(hypothesis, z, step, shot)
     assert (len(told.points) < hypothesis.dimension) == fewer
     for k in range(hypothesis.dimension):
         alone = z.copy()
@@ -88,7 +88,9 @@ def test_effects_that_couple_objects_keep_rollouts_apart(monkeypatch):
     simulator = MujocoSimulator(one.shapes, 30.0, 1)
     monkeypatch.setattr(Magnus, "couples", True)
     z = np.zeros(hypothesis.dimension)
-    told = beside(hypothesis, z, z + 0.01, lambda points: simulator.rollout(hypothesis.batch(points), 12))
+    told = beside(
+        hypothesis, z, z + 0.01, lambda points: (simulator.rollout(hypothesis.batch(points), 12), points[:, :0])
+    )
     assert len(told.points) == 1 + hypothesis.dimension
     assert told.felt.all()
 
@@ -98,14 +100,14 @@ def test_where_a_moved_object_meets_another_rollouts_are_made_again(monkeypatch)
     hypothesis = Hypothesis(Space.around(one))
     simulator, asked = MujocoSimulator(one.shapes, 30.0, 1), []
 
-    def poses_of(points):
+    def shot(points):
         asked.append(len(points))
-        return simulator.rollout(hypothesis.batch(points), 12)
+        return simulator.rollout(hypothesis.batch(points), 12), np.zeros((len(points), 0))
 
     told = iter([np.zeros((2, 2), bool), ~np.eye(2, dtype=bool)])
     monkeypatch.setattr(apart, "meetings", lambda poses, radius: next(told))
     z = np.zeros(hypothesis.dimension)
-    found = beside(hypothesis, z, z + 0.01, poses_of)
+    found = beside(hypothesis, z, z + 0.01, shot)
     assert len(asked) == 3
     assert found.felt.all()
     assert len(found.points) == 1 + hypothesis.dimension
