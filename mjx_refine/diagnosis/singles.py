@@ -62,7 +62,7 @@ Row = tuple[Fit, Lead, float]
 def singles_of(
     clip: ClipFit, base: Fit, names, scene: Scene, shown: Shown, seed: int, told: Told, video: bool, before: Fitted
 ) -> tuple[Fit, tuple[Candidate, ...], list[Fit]]:
-    """The base model's fit and the effects' by themselves, those found ``before`` and others; and what more noise was fitted with."""
+    """The base model's fit, the effects' by themselves, found ``before`` or now, and those that more noise was fitted with."""
     fitted, shots = dict(before), bool(base.hypothesis.nodes)
     unbent: list[Fit] = []
     walled: list[Fit] = []

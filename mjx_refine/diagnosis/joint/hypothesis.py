@@ -113,6 +113,14 @@ class JointHypothesis:
             result[index] = part.tails
         return result
 
+    @functools.cached_property
+    def loose(self) -> Bool[np.ndarray, "dimension"]:
+        """Which coordinates no prior holds, see ``Hypothesis.loose``."""
+        result = np.empty(self.dimension, bool)
+        for part, index in zip(self.parts, self.index, strict=True):
+            result[index] = part.loose
+        return result
+
     def values(self, z: Float[np.ndarray, "batch dimension"], k: int) -> Float[np.ndarray, "batch parameters"]:
         """The numbers of term ``k``."""
         return self.parts[0].values(z[:, self.index[0]], k)
