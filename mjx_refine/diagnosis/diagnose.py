@@ -345,4 +345,10 @@ def _notes(clip: ClipFit, compared: Compared, said: Answer, matching, names, bes
         notes.append(
             f"{compared.impacts} impacts may each err by 8 % of their change of velocity before anything else is blamed."
         )
+    if nodes := compared.base.hypothesis.nodes:
+        at = "; ".join(f"{names[n.target]} in frame {n.frame}" for n in nodes)
+        notes.append(
+            f"After impacts paths go on from states of their own ({at}): the fits follow the clip there, the replayed scene, in "
+            "which nothing restarts, only as far as engines agree about an impact."
+        )
     return (*notes, *grip_notes(best.fit if best is not None else compared.base))
