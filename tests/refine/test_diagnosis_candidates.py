@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_diagnosis import FLIGHT
 
-from mjx_refine.diagnosis import candidates, pairs, search
+from mjx_refine.diagnosis import candidates, pairs, singles
 from mjx_refine.diagnosis.base import base_space
 from mjx_refine.diagnosis.candidates import AGAINST, AT_IMPACT, DOUBT, LEAST_UNIT, Candidate, in_order, lead_of
 from mjx_refine.diagnosis.fitted import Fit
@@ -176,10 +176,10 @@ def test_twos_with_a_push_are_tried_with_an_obstacle_and_with_a_patch_in_its_pla
     ],
 )
 def test_an_obstacle_that_is_leant_on_takes_no_place_of_one_that_is_hit(monkeypatch, kept, found, stays):
-    monkeypatch.setattr(search, "leans_on", lambda _clip, fit: fit.leans)
+    monkeypatch.setattr(singles, "leans_on", lambda _clip, fit: fit.leans)
     key, (evidence, leans) = ("hidden_obstacle", 0), found
     new: Any = SimpleNamespace(evidence=evidence, leans=leans)
     old: Any = None if kept is None else SimpleNamespace(evidence=kept[0], leans=kept[1])
     fitted: dict = {} if old is None else {key: (old, 1.0)}
-    search._keep(cast(Any, None), fitted, key, new, 2.0)
+    singles._keep(cast(Any, None), fitted, key, new, 2.0)
     assert fitted[key] == ((old, 1.0) if stays else (new, 2.0))
