@@ -11,7 +11,7 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from mjx_refine.batch import SceneBatch, batch_from_scenes
+from mjx_refine.batch import ARRAYS, SceneBatch, batch_from_scenes
 from mjx_refine.scene import SHAPES, Body, Camera, Scene
 from mjx_refine.scene.read import scene_from_entries
 from mjx_refine.scene.write import scene_entries
@@ -80,7 +80,7 @@ STARTS = {
 
 def numbers(scene: Scene) -> np.ndarray:
     batch = batch_from_scenes([scene])
-    fields = [f.name for f in dataclasses.fields(batch) if f.name not in ("shapes", "effects")]
+    fields = list(ARRAYS)
     return np.concatenate([getattr(batch, name).reshape(-1) for name in fields])
 
 
@@ -157,7 +157,7 @@ def points_of(space: Space, seed: int, count: int = 20) -> np.ndarray:
 def check_physical(space: Space, u: np.ndarray) -> None:
     batch = space.decode(u)
     for f in dataclasses.fields(batch):
-        if f.name not in ("shapes", "effects"):
+        if f.name in ARRAYS:
             assert np.isfinite(getattr(batch, f.name)).all(), f.name
     extents = {"sphere": 1, "cylinder": 2, "box": 3}
     for i, shape in enumerate(batch.shapes):
