@@ -14,6 +14,7 @@ from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.sim.model import model_fields
 
 Shot = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""Points, one a row, to poses and what paths miss."""
 
 
 @dataclasses.dataclass(frozen=True)

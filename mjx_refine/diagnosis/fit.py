@@ -118,17 +118,23 @@ class ClipFit:
         self.set_slackness(self.slackness)
         return found
 
+    def contacts_along(self, fit: Fit) -> tuple[SceneBatch, Float[np.ndarray, "frames objects 7"], Contacts] | None:
+        """A fit's candidate, its path, and the contacts on it; None where no path is."""
+        batch, poses = fit.hypothesis.batch(fit.z[None]), self.poses(fit.hypothesis, fit.z[None])[0]
+        if not np.isfinite(poses).all():
+            return None
+        plain = self.poses(*fit.ordinary)[0] if fit.hypothesis.terms else None
+        return batch, poses, self._contacts(batch, poses, plain)
+
     def slack_along(self, fit: Fit) -> Float[np.ndarray, "residuals columns"] | None:
         """What contacts along a fit's own path may err by, as a hypothesis holds it; None where none may, or no path is."""
         along = None if self._columns is None else self._loose_along(fit)
         return None if along is None else along[0].columns(self.slackness, self.rigid)
 
     def _loose_along(self, fit: Fit) -> tuple[Loose, int] | None:
-        batch, poses = fit.hypothesis.batch(fit.z[None]), self.poses(fit.hypothesis, fit.z[None])[0]
-        if not np.isfinite(poses).all():
+        if (along := self.contacts_along(fit)) is None:
             return None
-        plain = self.poses(*fit.ordinary)[0] if fit.hypothesis.terms else None
-        found, long = self._contacts(batch, poses, plain)
+        batch, poses, (found, long) = along
         found, still = with_struck(found, fit.hypothesis.nodes), self.predictor(poses[None], batch)
         kicks = self.kicks(batch, poses, still, [*found, *long], PART) if found or long else None
         return self._loosened(batch, poses, found, still, kicks), len(found)
@@ -174,8 +180,8 @@ class ClipFit:
 
     def settle_noise(self, fit: Fit, order: int = 2) -> None:
         """Sets the noise to what changes from frame to frame in the residuals of a fit, in differences of this order."""
-        # As they are: what the robust loss makes of large residuals bends less than they do.
         told = self.predictor(self.poses(fit.hypothesis, fit.z[None]), fit.hypothesis.batch(fit.z[None]))
+        # As they are: what the robust loss makes of large residuals bends less than they do.
         white = self.rigid(self.distances(told), None, 1e9)[0]
         self.measured, self.counts = settled(self.measured, self.measured.split(white), self.counts, order)
         self.noise = everywhere(self.measured, self.frames)
@@ -203,16 +209,12 @@ class ClipFit:
         if self._columns is None:
             return None
         own, excused = (None, None) if told is None else (told.slack, told.excused)
-        return self._slacks.of(self._columns if own is None else own, excused, keep, self.kept)
+        return self._slacks.of(self._columns if own is None else own, excused, keep, self.measured.kept)
 
     @property
     def slack_columns(self) -> Float[np.ndarray, "residuals columns"]:
-        """What residuals may err by."""
+        """What the residuals may err by, one standard deviation a column."""
         return np.zeros((len(self.measured.objects), 0)) if self._columns is None else self._columns
-
-    def kept(self, keep: np.ndarray) -> np.ndarray:
-        """Which residuals belong to kept frames."""
-        return self.measured.kept(keep)
 
     def known(self, fit: Fit) -> Float[np.ndarray, "residuals"]:
         """A fit's residuals of what was measured, without those of nodes."""
@@ -262,7 +264,7 @@ class ClipFit:
             for raw, sigma, count, patience in zip(distances, self.widths, counts, PATIENCE, strict=True)
         ]
         white = Parts(*parts).flat()
-        return white if keep is None else white * self.kept(keep)
+        return white if keep is None else white * self.measured.kept(keep)
 
     def expected(self, beside: bool = True) -> float:
         """Sum of squares that noise alone would give, with the background's or without."""
@@ -385,8 +387,7 @@ class ClipFit:
         price_of_z, slope = prior(hypothesis, z)
         cost = data + 0.5 * float(price_of_z @ price_of_z)
         logdet = float(np.linalg.slogdet(jacobian.T @ jacobian + np.diag(slope**2))[1])
-        slack = self._slack(keep, hypothesis)
-        price = hypothesis.price + (slack.price if slack else 0.0)
+        price = hypothesis.price + (slack.price if (slack := self._slack(keep, hypothesis)) else 0.0)
         return Fit(hypothesis, z, cost, data, jacobian, base, -cost - 0.5 * logdet - price, ended)
 
     def at(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE) -> Fit:

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from mjx_refine import rotations
 from mjx_refine.batch import Restart, SceneBatch
+from mjx_refine.diagnosis.noise import BLUR
 from mjx_refine.diagnosis.slack import PART, Impact
 from mjx_refine.search.residuals import slowed
 
@@ -26,10 +27,8 @@ WIDTH = np.repeat([0.03, 0.15, 0.4, 1.5], 3)
 """Units in which a state is fitted [m, rad, m/s, rad/s]."""
 
 LEAST = np.repeat([0.002, 0.01, 0.01, 0.03], 3)
-"""What a path may miss the next one's begin by at least, beside what impacts err by, in the same units."""
-
-LATE = 0.05
-"""Part of a frame that an impact may be early or late by."""
+"""What a path may miss the next one's begin by at least, beside what impacts err by, in the same units. Like the other constants
+here but HELD, chosen before the first fit with nodes, and not since."""
 
 FORGIVEN = 2.0
 """Deviations beyond which missing the next path's begin costs ever less: a tumbling body may go anywhere."""
@@ -38,7 +37,7 @@ LEAST_LEFT = 4
 """Frames that must be left after a node."""
 
 HELD = 1e-3
-"""Prior precision of a coordinate, in its units: hardly any, since what is missed costs."""
+"""Slope of a coordinate's prior, in its units: hardly any, since what is missed costs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,9 +151,8 @@ def _rows(found: list[Impact]) -> list[list[Impact]]:
 
 
 def _sigma(row: list[Impact], frame: int, size: float, fps: float) -> Float[np.ndarray, "12"]:
-    change = float(np.sqrt(sum((i.change + 0.5 * i.turn) ** 2 for i in row)))
-    twist = float(np.sqrt(sum((i.turn + 0.3 * i.change) ** 2 for i in row))) / size
+    changes = np.linalg.norm([[i.blow, i.twist / size] for i in row], axis=0)
     lag = max(frame - row[0].frame, 1) / fps
-    speeds = np.array([PART * change, PART * twist])
-    places = speeds * lag + LATE / fps * np.array([change, twist])
-    return LEAST + np.repeat([places[0], places[1], speeds[0], speeds[1]], 3)
+    speeds = PART * changes
+    places = speeds * lag + BLUR / fps * changes
+    return LEAST + np.repeat([*places, *speeds], 3)

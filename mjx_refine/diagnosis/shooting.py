@@ -12,7 +12,7 @@ from mjx_refine.diagnosis.exchange import Fitted
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.nodes import COORDINATES, nodes_of
-from mjx_refine.diagnosis.slack import contacts, states, touching
+from mjx_refine.diagnosis.slack import states, touching
 
 KEPT = 8
 """Effects that were found without nodes and are fitted with them."""
@@ -24,16 +24,11 @@ FIRST, ITERATIONS = 14, 12
 def with_nodes(clip: ClipFit, fit: Fit) -> Fit:
     """A fit with nodes along its path, at its numbers; the same where nothing hits anything and flies on. Its derivatives are not
     to be used."""
-    batch, poses, fps = (
-        fit.hypothesis.batch(fit.z[None]),
-        clip.poses(fit.hypothesis, fit.z[None])[0],
-        clip.simulator.fps,
-    )
-    if not np.isfinite(poses).all():
+    if (along := clip.contacts_along(fit)) is None:
         return fit
-    plain = clip.poses(*fit.ordinary)[0] if fit.hypothesis.terms else None
-    found = contacts(batch, poses, plain, fps)[0]
-    nodes = nodes_of(batch, poses, *states(clip.simulator, batch, poses), touching(batch, poses), found, fps)
+    batch, poses, (found, _) = along
+    velocity, spin = states(clip.simulator, batch, poses)
+    nodes = nodes_of(batch, poses, velocity, spin, touching(batch, poses), found, clip.simulator.fps)
     if not nodes:
         return fit
     ground = fit.hypothesis.ground

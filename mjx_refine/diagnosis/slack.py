@@ -76,6 +76,16 @@ class Impact:
     change: float
     turn: float
 
+    @property
+    def blow(self) -> float:
+        """What its error of velocity is a part of [m/s]: what turns a body may as well have pushed it."""
+        return self.change + 0.5 * self.turn
+
+    @property
+    def twist(self) -> float:
+        """What its error of spin, times the body's size, is a part of [m/s]: what pushed a body may as well have turned it."""
+        return self.turn + 0.3 * self.change
+
 
 Contacts = tuple[list[Impact], list[Impact]]
 """Impacts, and times on the floor."""
@@ -283,13 +293,13 @@ def kicked(
     rows = np.repeat(poses[None], 6 * len(found), 0)
     for k, impact in enumerate(found):
         size = float(batch.size[0, impact.target].max())
-        width = part * (impact.change + 0.5 * impact.turn)
+        width = part * impact.blow
         for axis in range(6):
             dv, dw = np.zeros(3), np.zeros(3)
             if axis < 3:
                 dv[axis] = width
             else:
-                dw[axis - 3] = part * (impact.turn + 0.3 * impact.change) / size
+                dw[axis - 3] = part * impact.twist / size
             starts.setdefault(impact.frame, []).append((6 * k + axis, dv, dw))
     for frame, members in starts.items():
         here = _restarted(batch, poses[frame], velocity[frame], spin[frame], len(members))

@@ -7,13 +7,13 @@ import hashlib
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from mjx_refine.batch import BatchEffect, SceneBatch
+from mjx_refine.batch import SceneBatch
 from mjx_refine.effects.registry import acting_kind
 from mjx_refine.sim.backends import Simulator
 
@@ -107,28 +107,30 @@ class Recalling:
         """As the simulator's; not to be written to."""
         if batch.restarts:
             return self.shot(batch, frames)[0]
-        moving = dataclasses.replace(batch, effects=_moving(batch))
+        return self._remembered(batch, frames, self.simulator.rollout)
+
+    def shot(self, batch: SceneBatch, frames: int) -> tuple[np.ndarray, np.ndarray]:
+        """As the simulator's; not to be written to."""
+
+        def made(moving: SceneBatch, frames: int) -> np.ndarray:
+            return np.concatenate([part.reshape(len(moving), -1) for part in self.simulator.shot(moving, frames)], 1)
+
+        found, count = self._remembered(batch, frames, made), len(batch.restarts)
+        poses, arrived = np.split(found, [found.shape[1] - 13 * count], 1)
+        return poses.reshape(len(batch), frames, -1, 7), arrived.reshape(len(batch), count, 13)
+
+    def _remembered(self, batch: SceneBatch, frames: int, made: Callable[[SceneBatch, int], np.ndarray]) -> np.ndarray:
+        """What was kept of a batch that moves in the same way, or what is made of it now."""
+        acting = tuple(e for e in batch.effects if (kind := acting_kind(e.name)).physical or kind.retimes)
+        moving = dataclasses.replace(batch, effects=acting)
         key = self._key(moving, frames)
         found = self.memory.recall(key)
         if found is not None:
             self.recalled += 1
             return found
-        poses = self.simulator.rollout(moving, frames)
-        self.memory.keep(key, poses)
-        return poses
-
-    def shot(self, batch: SceneBatch, frames: int) -> tuple[np.ndarray, np.ndarray]:
-        """As the simulator's; not to be written to."""
-        moving = dataclasses.replace(batch, effects=_moving(batch))
-        key, count = self._key(moving, frames), len(batch.restarts)
-        found = self.memory.recall(key)
-        self.recalled += found is not None
-        if found is None:
-            poses, arrived = self.simulator.shot(moving, frames)
-            found = np.concatenate([poses.reshape(len(batch), -1), arrived.reshape(len(batch), -1)], 1)
-            self.memory.keep(key, found)
-        poses, arrived = np.split(found, [found.shape[1] - 13 * count], 1)
-        return poses.reshape(len(batch), frames, -1, 7), arrived.reshape(len(batch), count, 13)
+        told = made(moving, frames)
+        self.memory.keep(key, told)
+        return told
 
     def _key(self, batch: SceneBatch, frames: int) -> str:
         """A fingerprint of all that a rollout depends on."""
@@ -138,11 +140,6 @@ class Recalling:
         for part in _parts(batch):
             state.update(part)
         return state.hexdigest()
-
-
-def _moving(batch: SceneBatch) -> tuple[BatchEffect, ...]:
-    """The effects that change a rollout."""
-    return tuple(e for e in batch.effects if (kind := acting_kind(e.name)).physical or kind.retimes)
 
 
 def _parts(batch: SceneBatch) -> Iterator[bytes]:

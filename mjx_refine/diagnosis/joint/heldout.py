@@ -96,7 +96,7 @@ def foretell(clip: ClipFit, part: Hypothesis, z: Float[np.ndarray, "part"], earl
         keep = early & (np.arange(len(early)) <= frames[max(int(share * len(frames)) - 1, 3)])
         at = clip.fit(hypothesis, at, 8, keep, FORGIVING).z
     fit = clip.fit(hypothesis, at, 10, early)
-    if (fit.residual**2).sum() > GOOD * (counts_of(clip) * clip.kept(early)).sum():
+    if (fit.residual**2).sum() > GOOD * (counts_of(clip) * clip.measured.kept(early)).sum():
         fit = clip.hop(fit, seed, 2, 48, early)
     return _foretold(clip, fit, early, seed)
 
@@ -107,7 +107,7 @@ def _foretold(clip: ClipFit, fit: Fit, early: np.ndarray, seed: int) -> Foretold
     draws = np.clip(fit.z + generator.standard_normal((DRAWS, len(fit.z))) @ factor, *fit.hypothesis.bounds)
     z = np.concatenate([fit.z[None], draws])
     prediction = clip.predictor(clip.poses(fit.hypothesis, z), fit.hypothesis.batch(z))
-    counts = counts_of(clip) * clip.kept(~early)
+    counts = counts_of(clip) * clip.measured.kept(~early)
     rows = clip.rigid(clip.distances(prediction), None, WIDE) / np.sqrt(np.maximum(counts_of(clip), 1e-12))
     rows = np.where(counts > 0, rows, 0.0)
     spread = (
@@ -128,7 +128,7 @@ def excused(clip: ClipFit, told: Foretold, early: np.ndarray, slackness: float) 
     blur, columns = np.concatenate([w.ravel() for w in _squares(clip)]), clip.slack_columns
     clip.forget_slack(before)
     plain = np.concatenate([w.ravel() for w in _squares(clip)])
-    counts = counts_of(clip) * clip.kept(~early)
+    counts = counts_of(clip) * clip.measured.kept(~early)
     # Columns are in widths of the blurred noise, times the root of the count.
     wide = (columns**2).sum(1) / np.maximum(counts_of(clip), 1e-12) * blur / plain + (blur - plain) / plain
     more = float((counts * np.minimum(wide, WIDE**2)).sum() / max(float(counts.sum()), 1e-9))

@@ -249,4 +249,4 @@ class PosesFit(ClipFit):
         """Robust residuals in noise widths; zero where nothing was measured, and in samples that are not kept."""
         raw = [np.nan_to_num(part) / width for part, width in zip(distances, self.widths, strict=True)]
         white = Parts(*(slowed(part, scale * PATIENCE) for part in raw)).flat() * np.sqrt(self.weight)
-        return white if keep is None else white * self.kept(keep)
+        return white if keep is None else white * self.measured.kept(keep)
