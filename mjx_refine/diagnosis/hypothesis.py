@@ -27,6 +27,9 @@ off: with numbers 19 and 29 widths off two cylinders that met obstacles (seed 18
 FARTHEST = 60.0
 """Bounds of nodes' coordinates, in their units."""
 
+SMALL = 1e-4
+"""Prior widths by which coordinates are moved to see what that does to an effect's numbers."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Term:
@@ -42,6 +45,7 @@ class Term:
       free: which numbers are fitted; the others stay at ``centre``.
       places: how many places or moments were looked through for this one; its logarithm is paid as evidence.
       excused: what the impact that the effect makes may err by, one standard deviation a column [noise widths]; None: nothing.
+      pivot: an outline along which its coordinates turn what is turned; ``centre``, ``width`` and bounds are of these.
     """
 
     name: str
@@ -53,10 +57,39 @@ class Term:
     free: Bool[np.ndarray, "parameters"]
     places: int = 1
     excused: Float[np.ndarray, "residuals columns"] | None = None
+    pivot: Float[np.ndarray, "points 2"] | None = None
 
     @property
     def kind(self) -> EffectKind:
         return acting_kind(self.name)
+
+    def values(self, z: Float[np.ndarray, "batch free"]) -> Float[np.ndarray, "batch parameters"]:
+        """The effect's numbers at free coordinates in prior widths."""
+        told = np.repeat(self.centre[None], len(z), 0)
+        free = self.free
+        told[:, free] = np.clip(self.centre[free] + z * self.width[free], self.low[free], self.high[free])
+        return self._own(told)
+
+    def slope(self, z: Float[np.ndarray, "free"]) -> Float[np.ndarray, "free parameters"]:
+        """Change of the effect's numbers with each free coordinate, in prior widths."""
+        steps = np.zeros((len(z) + 1, len(self.centre)))
+        steps[:, self.free] = z + np.concatenate([np.zeros((1, len(z))), SMALL * np.eye(len(z))])
+        told = self._own(self.centre + steps * self.width)
+        return (told[1:] - told[0]) / SMALL
+
+    def _own(self, coordinates: np.ndarray) -> np.ndarray:
+        return coordinates if self.pivot is None else self.kind.from_pivot(coordinates, self.pivot)
+
+    @property
+    def bounds(self) -> tuple[Float[np.ndarray, "free"], Float[np.ndarray, "free"]]:
+        """Lower and upper bounds of the free coordinates."""
+        low, high = (((bound - self.centre) / self.width)[self.free] for bound in (self.low, self.high))
+        return low, high
+
+    def at(self, values: Float[np.ndarray, "batch parameters"]) -> Float[np.ndarray, "batch free"]:
+        """The free coordinates in prior widths at which the effect's numbers are these."""
+        told = values if self.pivot is None else self.kind.to_pivot(values, self.pivot)
+        return ((told - self.centre) / self.width)[:, self.free]
 
 
 def term(name: str, target: int, frames: int, start: np.ndarray | None = None, **changes) -> Term:
@@ -109,8 +142,9 @@ class Hypothesis:
         lows = [-self.space.start / self.space.sigma, -far]
         highs = [(1.0 - self.space.start) / self.space.sigma, far]
         for t in self.terms:
-            lows.append(((t.low - t.centre) / t.width)[t.free])
-            highs.append(((t.high - t.centre) / t.width)[t.free])
+            low, high = t.bounds
+            lows.append(low)
+            highs.append(high)
         return np.concatenate(lows), np.concatenate(highs)
 
     @property
@@ -178,10 +212,7 @@ class Hypothesis:
         """The numbers of term ``k``."""
         start = self.ground + sum(int(t.free.sum()) for t in self.terms[:k])
         t = self.terms[k]
-        result = np.repeat(t.centre[None], len(z), 0)
-        part = z[:, start : start + int(t.free.sum())]
-        result[:, t.free] = np.clip(t.centre[t.free] + part * t.width[t.free], t.low[t.free], t.high[t.free])
-        return result
+        return t.values(z[:, start : start + int(t.free.sum())])
 
     def batch(self, z: Float[np.ndarray, "batch dimension"]) -> SceneBatch:
         """The candidates at ``z``."""

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.pace import FAR_BEHIND
 from mjx_refine.diagnosis.slack import Impact, spins
 
@@ -36,7 +37,7 @@ def knocked(clip: ClipFit, fit: Fit, rival: float = np.inf) -> Fit:
         if fit.cost > HOPE * rival + FAR_BEHIND:
             break
         terms = tuple(
-            dataclasses.replace(t, excused=excuses(clip, fit, k)) if t.kind.strikes else t
+            dataclasses.replace(t, excused=excuses(clip, fit.hypothesis, fit.z, k)) if t.kind.strikes else t
             for k, t in enumerate(fit.hypothesis.terms)
         )
         own = dataclasses.replace(fit.hypothesis, terms=terms, slack=clip.slack_along(fit))
@@ -55,9 +56,11 @@ def to_the_end(clip: ClipFit, fit: Fit, iterations: int, rival: float) -> Fit:
     return knocked(clip, fit if fit.ended else clip.gone_on(fit, iterations, rival), rival)
 
 
-def excuses(clip: ClipFit, fit: Fit, k: int) -> Float[np.ndarray, "residuals columns"] | None:
+def excuses(
+    clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimension"], k: int
+) -> Float[np.ndarray, "residuals columns"] | None:
     """What the first impact of term ``k`` may err by, one standard deviation a column; None where there is none."""
-    hypothesis, z, fps = fit.hypothesis, fit.z[None], clip.simulator.fps
+    z, fps = z[None], clip.simulator.fps
     batch = hypothesis.batch(z)
     free = dataclasses.replace(batch, effects=batch.effects[:k] + batch.effects[k + 1 :])
     poses, plain = clip.poses(hypothesis, z)[0], clip.rollout(free, clip.frames)[0]

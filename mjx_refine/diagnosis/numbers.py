@@ -20,23 +20,27 @@ def values_at(clip: ClipFit, fit: Fit, k: int) -> dict[str, Value]:
     hypothesis = fit.hypothesis
     covariance = np.linalg.inv(fit.curvature) * max(1.0, clip.misfit(fit))
     first = hypothesis.ground + sum(int(o.free.sum()) for o in hypothesis.terms[:k])
-    values = hypothesis.values(fit.z[None], k)[0]
-    return values_of(hypothesis.terms[k], values, np.sqrt(np.diag(covariance))[first:], clip.frames)
+    return values_of(hypothesis.terms[k], fit.z[first:], covariance[first:, first:], clip.frames)
 
 
 def values_of(
-    term: Term, values: Float[np.ndarray, "values"], deviation: Float[np.ndarray, "coordinates"], frames: int
+    term: Term,
+    z: Float[np.ndarray, "coordinates"],
+    covariance: Float[np.ndarray, "coordinates coordinates"],
+    frames: int,
 ) -> dict[str, Value]:
     """Parameters of an effect with 90 % intervals; of what has many numbers their root mean square.
 
     Args:
       term: the effect.
-      values: all its numbers.
-      deviation: standard errors in prior widths, those of the term's free coordinates first.
+      z: coordinates in prior widths, those that the term leaves free first.
+      covariance: of their errors.
       frames: of the clip.
     """
-    wide_all = np.zeros(len(term.centre))
-    wide_all[term.free] = 1.645 * deviation[: int(term.free.sum())] * term.width[term.free]
+    count = int(term.free.sum())
+    values = term.values(z[None, :count])[0]
+    slope = term.slope(z[:count])
+    wide_all = 1.645 * np.sqrt(np.einsum("ip,ij,jp->p", slope, covariance[:count, :count], slope))
     result: dict[str, Value] = {}
     at = 0
     for p in term.kind.parameters:

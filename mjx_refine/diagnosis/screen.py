@@ -59,7 +59,10 @@ def term_of(name: str, target: int, start: Start, frames: int) -> Term:
     free = one.free.copy()
     free[list(start.fixed)] = False
     width = one.width if start.width is None else start.width
-    return dataclasses.replace(one, width=width, free=free, places=start.places)
+    one = dataclasses.replace(one, width=width, free=free, places=start.places)
+    if start.pivot is None:
+        return one
+    return dataclasses.replace(one, pivot=start.pivot, centre=one.kind.to_pivot(one.centre[None], start.pivot)[0])
 
 
 class Screen:

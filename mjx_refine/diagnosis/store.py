@@ -126,7 +126,8 @@ def _tokens(part: object) -> Iterable[bytes]:
         for n in part.nodes:
             yield from _tokens((n.target, n.frame, n.state, n.sigma))
         for t in part.terms:
-            yield from _tokens((t.name, t.target, t.centre, t.width, t.low, t.high, t.free, t.places, t.excused))
+            numbers = (t.centre, t.width, t.low, t.high, t.free, t.places, t.excused, t.pivot)
+            yield from _tokens((t.name, t.target, *numbers))
     elif isinstance(told := getattr(part, "parts", None), tuple):
         # Of several clips.
         yield from _tokens((getattr(part, "z", None), told))

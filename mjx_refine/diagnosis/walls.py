@@ -9,7 +9,7 @@ import numpy as np
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.knock import knocked
+from mjx_refine.diagnosis.knock import excuses, knocked
 from mjx_refine.diagnosis.screen import term_of
 from mjx_refine.effects.hidden_obstacle import HiddenObstacle
 from mjx_refine.effects.kind import FitView
@@ -71,7 +71,7 @@ def _facings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis, n
     starts = [HiddenObstacle().facing(there, push.target, t, along + turn) for turn in TURNS for t in moments]
     one = term_of("hidden_obstacle", push.target, dataclasses.replace(starts[0], places=clip.frames), clip.frames)
     hypothesis = rest.added(one)
-    own = np.array([((start.values - one.centre) / one.width)[one.free] for start in starts])
+    own = one.at(np.array([start.values for start in starts]))
     points = np.concatenate([np.repeat(fit.z[None, : rest.dimension], len(own), 0), own], 1)
     costs = clip.residuals(hypothesis, points)[1].reshape(len(TURNS), -1)
     facing = {*np.argsort(costs.min(1))[:FACINGS].tolist(), TURNS.index(0.0)}
@@ -79,4 +79,10 @@ def _facings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis, n
 
 
 def _wall(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray, rival: float) -> Fit:
-    return knocked(clip, clip.fit(hypothesis, z, ITERATIONS, rival=PATIENCE * rival), rival)
+    """The better of two: one whose impact errs from the first step on, and one whose impact does once its place is found."""
+    late = knocked(clip, clip.fit(hypothesis, z, ITERATIONS, rival=PATIENCE * rival), rival)
+    place = len(hypothesis.terms) - 1
+    *others, wall = hypothesis.terms
+    wall = dataclasses.replace(wall, excused=excuses(clip, hypothesis, z, place))
+    early = clip.fit(dataclasses.replace(hypothesis, terms=(*others, wall)), z, ITERATIONS, rival=PATIENCE * rival)
+    return max(late, knocked(clip, early, rival), key=lambda fit: fit.evidence)

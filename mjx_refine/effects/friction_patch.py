@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Motion, Start, glance, rim_speed
+from mjx_refine.effects.closing import glance, rim_speed
+from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Motion, Start
 
 LATE, WIDE = (0, 1, 2, 4, 8), (1, 2, 4, 8)
 """How many frames late an object may be at the middle of a patch, and how many it may take from there to the border."""

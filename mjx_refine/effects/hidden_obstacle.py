@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 
 import numpy as np
 from jaxtyping import Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
+from mjx_refine.effects.closing import GAIN, GLANCE, glance, swing
 from mjx_refine.effects.kind import (
-    GAIN,
-    GLANCE,
     EffectKind,
     EffectParameter,
     FitView,
     Loads,
     Motion,
     Start,
-    glance,
     of_target,
-    swing,
 )
+from mjx_refine.scene import Shape
 
 STIFFNESS = 20000.0
 """Of the wall's contact at most [1/s^2]."""
+
+ROUND = 48
+"""Points of a circle seen from above."""
 
 
 class HiddenObstacle(EffectKind):
@@ -92,6 +94,13 @@ class HiddenObstacle(EffectKind):
         later = near[near > first + 3]
         return max(first - 1, 0), int(near[-1] if len(later) == 0 or len(near) > 6 else near[near <= first + 3][-1])
 
+    def to_pivot(self, values: np.ndarray, pivot: np.ndarray) -> np.ndarray:
+        return values - _beyond(values, pivot)
+
+    def from_pivot(self, coordinates: np.ndarray, pivot: np.ndarray) -> np.ndarray:
+        # A wall that is turned about the world's origin is elsewhere; turned about what touches it, it is hit at that moment.
+        return coordinates + _beyond(coordinates, pivot)
+
     def facing(self, view: FitView, target: int, frame: int, angle: float) -> Start:
         """The wall with the outward normal at ``angle`` [degree] that the target touches in ``frame``."""
         turned = np.radians(angle)
@@ -101,7 +110,31 @@ class HiddenObstacle(EffectKind):
         still = Motion(0.0, 1.0, pose[..., :3], pose[..., 3:], pose[..., :3], pose[..., :3], batch)
         reach = float((foremost(still, 0, -normal) * normal).sum())
         distance = float(normal[0, :2] @ pose[0, 0, :2]) + reach
-        return Start(np.array([angle, distance, 0.5]), width=np.array([25.0, 0.08, 0.3]))
+        outline = _from_above(view.batch.shapes[target], view.batch.size[0, target], pose[0, 0])
+        return Start(np.array([angle, distance, 0.5]), width=np.array([25.0, 0.08, 0.3]), pivot=outline)
+
+
+def _beyond(values: np.ndarray, pivot: np.ndarray) -> np.ndarray:
+    """How far along the normal an outline begins, as what is added to the distance, (batch, 3)."""
+    angle = np.deg2rad(values[:, 0])
+    begins = (np.stack([np.cos(angle), np.sin(angle)], -1) @ pivot.T).min(-1)
+    return np.stack([0 * angle, begins, 0 * angle], -1)
+
+
+def _from_above(
+    shape: Shape, size: Float[np.ndarray, "3"], pose: Float[np.ndarray, "7"]
+) -> Float[np.ndarray, "points 2"]:
+    """Points whose hull, seen from above, is a body's outline [m]."""
+    around = np.linspace(0.0, 2 * np.pi, ROUND, endpoint=False)
+    rim = np.stack([np.cos(around), np.sin(around), 0 * around], -1)
+    if shape == "sphere":
+        return pose[:2] + size[0] * rim[:, :2]
+    if shape == "box":
+        points = size * np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    else:
+        ends = np.concatenate([rim + np.array([0.0, 0.0, end]) for end in (-1.0, 1.0)])
+        points = ends * size[[0, 0, 1]]
+    return (pose[:3] + rotations.rotate(np.repeat(pose[None, 3:], len(points), 0), points))[:, :2]
 
 
 def gaps(

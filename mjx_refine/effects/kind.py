@@ -31,6 +31,7 @@ class Start:
       width: prior standard deviations where they are not the kind's.
       fixed: indices of parameters that stay as they are.
       places: how many such starts share the effect's prior probability.
+      pivot: an outline (points, 2) [m] along which fits turn what is turned (``EffectKind.from_pivot``), or None.
     """
 
     values: np.ndarray
@@ -38,6 +39,7 @@ class Start:
     width: np.ndarray | None = None
     fixed: tuple[int, ...] = ()
     places: int = 1
+    pivot: np.ndarray | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -283,6 +285,14 @@ class EffectKind:
         """Prior standard deviations for this scene."""
         return np.array([p.width for p in self.spread(view.frames)])
 
+    def to_pivot(self, values: np.ndarray, pivot: np.ndarray) -> np.ndarray:
+        """Coordinates, as many as ``values`` (batch, parameters), in which fits along an outline are straight."""
+        return values
+
+    def from_pivot(self, coordinates: np.ndarray, pivot: np.ndarray) -> np.ndarray:
+        """The inverse of ``to_pivot``."""
+        return coordinates
+
     def still(self, view: FitView, target: int) -> Start:
         """The start at which the effect does nothing."""
         width = self.widths(view, target)
@@ -364,32 +374,3 @@ def of_target(batch: SceneBatch, target: int, vector: np.ndarray) -> np.ndarray:
     result = np.zeros((*batch.mass.shape, 3))
     result[:, target] = vector
     return result
-
-
-GLANCE = 0.1
-"""Longest time for which nobody looks at where bodies are [s]."""
-
-GAIN = 20.0
-"""Acceleration that a body may have meanwhile [m/s^2]: twice that of gravity."""
-
-
-def glance(gap: Float[np.ndarray, "*batch"], closing: Float[np.ndarray, "*batch"] | float) -> float:
-    """For how long nothing that closes in at speeds ``closing`` [m/s] can cover ``gap`` [m], surely [s]."""
-    gap = np.maximum(gap, 0.0)
-    time = (np.sqrt(closing * closing + 2 * GAIN * gap) - closing) / GAIN
-    # What has diverged goes nowhere.
-    return float(np.min(time, initial=GLANCE, where=np.isfinite(time)))
-
-
-def rim_speed(motion: Motion) -> Float[np.ndarray, "batch objects"]:
-    """How fast spin moves what lies farthest from a body's centre, at most [m/s]."""
-    return np.linalg.norm(motion.turning, axis=-1) * np.linalg.norm(motion.batch.size, axis=-1)
-
-
-def swing(motion: Motion, target: int) -> Float[np.ndarray, "batch"]:
-    """How fast spin moves a body's outline at most [m/s]: a ball's and a rolling cylinder's stays where it is."""
-    shape = motion.batch.shapes[target]
-    if shape == "sphere":
-        return np.zeros(len(motion.turning))
-    turning = motion.turning[:, target, : 2 if shape == "cylinder" else 3]
-    return np.linalg.norm(turning, axis=-1) * np.linalg.norm(motion.batch.size[:, target], axis=-1)

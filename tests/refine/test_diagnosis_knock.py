@@ -39,7 +39,7 @@ def test_the_price_is_half_the_logarithm_of_the_determinant():
 def test_only_what_follows_the_impact_is_excused():
     fit_of, hypothesis, z = fitted((WALL,))
     fit_of.allow_slack(fit_of.at(hypothesis, z))
-    columns = excuses(fit_of, fit_of.at(hypothesis, z), 0)
+    columns = excuses(fit_of, hypothesis, z, 0)
     assert columns is not None
     reach = np.array([np.abs(fit_of.measured.split(c).reach).max((1, 2)) for c in columns.T]).max(0)
     assert not reach[: HIT - 1].any()
@@ -50,7 +50,7 @@ def test_a_wall_that_is_never_met_excuses_nothing():
     fit_of, hypothesis, z = fitted(())
     far = dataclasses.replace(hypothesis.terms[0], centre=np.array([180.0, -9.0, 0.5]))
     fit = fit_of.at(dataclasses.replace(hypothesis, terms=(far,)), z)
-    assert excuses(fit_of, fit, 0) is None
+    assert excuses(fit_of, fit.hypothesis, fit.z, 0) is None
     assert knocked(fit_of, fit) is fit
 
 

@@ -145,5 +145,4 @@ def _values(clips: Clips, fit: JointFit, k: int) -> dict[str, Value]:
     # Shared coordinates: the base model's, then the terms'.
     terms = fit.hypothesis.terms
     first = fit.hypothesis.count - sum(int(o.free.sum()) for o in terms[k:])
-    values = fit.hypothesis.values(fit.z[None], k)[0]
-    return values_of(terms[k], values, np.sqrt(np.diag(covariance))[first:], clips.frames)
+    return values_of(terms[k], fit.z[first:], covariance[first:, first:], clips.frames)
