@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.fitted import Explained
@@ -33,6 +34,10 @@ tumbled and bounced without any effect led by 119 for one."""
 LEANT, AT = 0.5, 0.003
 """Part of the time at an obstacle, to this distance [m], above which it is nothing that an object hits: a wall that a body rubs
 along from beginning to end slows it down as the air does, or a floor."""
+
+STRUCK = 0.25
+"""Speed at which a body comes to an obstacle from which that is hit, however long the body then stays there [m/s]: what changes
+a velocity by less is no impact elsewhere either (``slack.LEAST``)."""
 
 LEAST_UNIT = 0.3
 """Mean square residual that is assumed at least where leads are told in its units."""
@@ -129,14 +134,20 @@ def in_order(clip: ClipFit, found: Sequence[Candidate]) -> tuple[Candidate, ...]
 
 
 def leans_on(clip: ClipFit, fit: Fit) -> bool:
-    """Whether an object is at an obstacle most of the time."""
+    """Whether an object is at an obstacle most of the time, and did not hit it."""
     walls = [k for k, t in enumerate(fit.hypothesis.terms) if t.name == "hidden_obstacle"]
     if not walls:
         return False
     z = fit.z[None]
     poses, batch = clip.poses(fit.hypothesis, z)[0], fit.hypothesis.batch(z)
     away = [gaps(batch, poses, fit.hypothesis.terms[k].target, fit.hypothesis.values(z, k)[0]) for k in walls]
-    return max(float((gap < AT).mean()) for gap in away) > LEANT
+    return any(float((gap < AT).mean()) > LEANT and _arrives_at(gap, clip.simulator.fps) < STRUCK for gap in away)
+
+
+def _arrives_at(gap: Float[np.ndarray, "frames"], fps: float) -> float:
+    """How fast a body comes to an obstacle in the frame before the first in which it is there [m/s]."""
+    first = int(np.argmax(gap < AT))
+    return float(gap[first - 2] - gap[first - 1]) * fps if first > 1 else 0.0
 
 
 def _bounces(clip: ClipFit, fit: Fit) -> bool:

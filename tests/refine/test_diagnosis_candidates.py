@@ -76,9 +76,22 @@ def test_beside_another_effect_an_obstacle_stands_before_a_push_too():
     assert [name for name, _ in order(both, wall)] == ["camera_motion+hidden_obstacle", "push+camera_motion"]
 
 
-@pytest.mark.parametrize(("share", "kept"), [(0.3, True), (0.7, False)])
-def test_an_obstacle_that_is_leant_on_is_none(share, kept):
-    """A ball that rolls along the x axis past a wall at its side, and touches it for a share of the time."""
+def left_early(share: float) -> np.ndarray:
+    """Distances from a wall that is touched from the beginning on, for a share of the time."""
+    return np.where(np.arange(30) < share * 30, 0.002, 0.05)
+
+
+def stayed_at(speed: float) -> np.ndarray:
+    """Distances from a wall that is reached in the sixth frame at a speed [m/s], and not left."""
+    return np.maximum(speed * (6 - np.arange(30)) / 30.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("away", "kept"),
+    [(left_early(0.3), True), (left_early(0.7), False), (stayed_at(0.5), True), (stayed_at(0.1), False)],
+)
+def test_an_obstacle_that_is_leant_on_and_was_not_hit_is_none(away, kept):
+    """A ball that rolls along the x axis past a wall at its side."""
     frames, radius = 30, FLIGHT.objects[0].size[0]
     hypothesis = Hypothesis(base_space(FLIGHT), (term("hidden_obstacle", 0, frames, np.array([90.0, 0.0, 0.5])),))
     z = np.zeros(hypothesis.dimension)
@@ -86,9 +99,11 @@ def test_an_obstacle_that_is_leant_on_is_none(share, kept):
     poses[..., 3] = 1.0
     poses[:, 0, 0] = np.linspace(0.0, 2.0, frames)
     # The wall is y = 0, its outside y > 0.
-    poses[:, 0, 1] = np.where(np.arange(frames) < share * frames, radius + 0.002, radius + 0.05)
+    poses[:, 0, 1] = radius + away
     fit = Fit(hypothesis, z, 1.0, 1.0, np.zeros((1, len(z))), np.zeros(1), 0.0)
-    clip: Any = SimpleNamespace(misfit=lambda fit: MISFIT, poses=lambda hypothesis, z: poses[None])
+    clip: Any = SimpleNamespace(
+        misfit=lambda fit: MISFIT, poses=lambda hypothesis, z: poses[None], simulator=SimpleNamespace(fps=30.0)
+    )
     one = Candidate(fit, 50.0, 0.0)
     assert in_order(clip, [one]) == ((one,) if kept else ())
 
