@@ -246,6 +246,8 @@ def changed(changes):
         ({"closed": 0.05, "pair": 200.0}, "unknown"),
         ({"closed": 0.05, "lead": 20.0}, "none"),
         ({"closed": 0.05, "lead": 55.0}, "none"),
+        ({"lead": 20.0, "pair": 90.0}, "unknown"),
+        ({"lead": 20.0, "pair": 70.0}, "none"),
         ({"closed": 0.05, "lead": 55.0, "structure_after": 1.4}, "unknown"),
         ({"closed": 0.05, "lead": 110.0, "structure_before": 1.2}, "none"),
         ({"closed": 0.05, "lead": 130.0, "structure_before": 1.2}, "unknown"),
