@@ -26,7 +26,7 @@ from mjx_refine.diagnosis.slack import PART, Contacts, Impact, Slack, Slacks, co
 from mjx_refine.diagnosis.store import Arrays, Store, fingerprint, packed, remembered, unpacked
 from mjx_refine.scene import Shape
 from mjx_refine.search.residuals import slowed
-from mjx_refine.sim.backends import Simulator
+from mjx_refine.sim.backends import Restarting
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.sim.recalled import Recalling
 
@@ -49,7 +49,7 @@ class ClipFit:
     """
 
     def __init__(
-        self, simulator: Simulator, measured: Measured, image: tuple[int, int], frames: int, noise: Noise | None = None
+        self, simulator: Restarting, measured: Measured, image: tuple[int, int], frames: int, noise: Noise | None = None
     ):
         self.simulator, self.measured, self.image, self.frames = simulator, measured, image, frames
         self.noise = noise or everywhere(measured, frames)
@@ -303,7 +303,7 @@ class ClipFit:
         if not hypothesis.nodes:
             return self.rollout(batch, frames), np.zeros((len(batch), 0))
         self.rollouts += len(batch) * frames / self.frames
-        poses, arrived = self.simulator.shot(batch, frames)  # type: ignore[attr-defined]
+        poses, arrived = self.simulator.shot(batch, frames)
         return poses, missed_by(hypothesis.nodes, arrived, batch.restarts)
 
     def residuals(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE):

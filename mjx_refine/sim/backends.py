@@ -48,6 +48,16 @@ class Simulator(Protocol):
         ...
 
 
+class Restarting(Simulator, Protocol):
+    """One that also carries objects which restart along the way: C MuJoCo."""
+
+    def shot(
+        self, batch: SceneBatch, frames: int
+    ) -> tuple[Float[np.ndarray, "batch frames objects 7"], Float[np.ndarray, "batch restarts 13"]]:
+        """As ``rollout``, and the states in which objects arrive where they restart; NaN where that is later."""
+        ...
+
+
 def resolve_backend(name: str) -> str:
     """The backend that ``name`` means here: ``auto`` is warp where Warp and an NVIDIA GPU are, else mujoco.
 

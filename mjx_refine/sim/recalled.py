@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.effects.registry import acting_kind
-from mjx_refine.sim.backends import Simulator
+from mjx_refine.sim.backends import Restarting
 
 KEPT = 64 << 20
 """Bytes of poses that a process keeps; what was asked for longest ago goes first."""
@@ -96,7 +96,7 @@ class Recalling:
       memory: where they are kept; the process's own by default.
     """
 
-    def __init__(self, simulator: Simulator, memory: Memory | None = None):
+    def __init__(self, simulator: Restarting, memory: Memory | None = None):
         self.simulator, self.memory = simulator, memory or PROCESS
         self.name, self.device = simulator.name, simulator.device
         self.shapes, self.fps = simulator.shapes, simulator.fps
