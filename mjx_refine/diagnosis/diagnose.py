@@ -16,6 +16,7 @@ from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared
 from mjx_refine.diagnosis.crew import Crew, crew_of
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import HeldOut, held_out
+from mjx_refine.diagnosis.knock import strike_notes
 from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.mismatch import matched
 from mjx_refine.diagnosis.numbers import tied, values_at
@@ -351,4 +352,6 @@ def _notes(clip: ClipFit, compared: Compared, said: Answer, matching, names, bes
             f"After impacts paths go on from states of their own ({at}): the fits follow the clip there, the replayed scene, in "
             "which nothing restarts, only as far as engines agree about an impact."
         )
+    if best is not None:
+        notes += strike_notes(best.fit.hypothesis, names)
     return (*notes, *grip_notes(best.fit if best is not None else compared.base))

@@ -7,6 +7,7 @@ another impulse, and without this a push through the centre, which may have any 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -54,6 +55,16 @@ def knocked(clip: ClipFit, fit: Fit, rival: float = np.inf) -> Fit:
 def to_the_end(clip: ClipFit, fit: Fit, iterations: int, rival: float) -> Fit:
     """A fit that was interrupted, at its end, its impacts with unseen things as they may err."""
     return knocked(clip, fit if fit.ended else clip.gone_on(fit, iterations, rival), rival)
+
+
+def strike_notes(hypothesis: Hypothesis, names: Sequence[str]) -> list[str]:
+    """Sentences about impacts with unseen things that may err in a fit, and do not in a scene that is replayed."""
+    return [
+        f"What {names[t.target]} gets from the {t.name} may err by {BLOW:.0%} of its change of velocity: the fit follows the "
+        "clip after that impact, the replayed scene, in which nothing errs, only as far as such an impact is known."
+        for t in hypothesis.terms
+        if t.excused is not None and t.excused.size
+    ]
 
 
 def excuses(

@@ -10,7 +10,7 @@ from test_diagnosis import FLIGHT, clip_of
 from test_diagnosis_replay import started
 
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.knock import excuses, knocked
+from mjx_refine.diagnosis.knock import excuses, knocked, strike_notes
 from mjx_refine.diagnosis.slack import slack_of
 from mjx_refine.scene import Effect
 from mjx_refine.space import Space
@@ -41,6 +41,10 @@ def test_only_what_follows_the_impact_is_excused():
     fit_of.allow_slack(fit_of.at(hypothesis, z))
     columns = excuses(fit_of, hypothesis, z, 0)
     assert columns is not None
+    assert strike_notes(hypothesis, ["ball"]) == []
+    errs = dataclasses.replace(hypothesis, terms=(dataclasses.replace(hypothesis.terms[0], excused=columns),))
+    (note,) = strike_notes(errs, ["ball"])
+    assert note.startswith("What ball gets from the hidden_obstacle may err by 25% of its change of velocity")
     reach = np.array([np.abs(fit_of.measured.split(c).reach).max((1, 2)) for c in columns.T]).max(0)
     assert not reach[: HIT - 1].any()
     assert reach[HIT + 4 :].min() > 0
