@@ -48,7 +48,7 @@ def _crossings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis,
     plain = rest.space.dimension
     beside = fit.z[plain : rest.dimension]
     for ground in (fit.z[: rest.dimension], np.concatenate([np.zeros(plain), beside])):
-        at = [np.concatenate([ground, (one.centre - terms[0].centre) / terms[0].width]) for one in terms]
+        at = [np.concatenate([ground, own]) for own in terms[0].at(np.array([start.values for start in starts]))]
         white, costs = clip.residuals(rest.added(terms[0]), np.array(at))
         # Without the prior, which is the first one's.
         left = np.where(np.isfinite(costs), (white**2).sum(1), np.inf)
