@@ -155,7 +155,7 @@ def test_what_nothing_else_looks_like_is_unmistakable_where_it_leads_by_far(monk
     )
 
 
-SIGNS = Signs(300.0, 150.0, 0.0, 3.0, 0.8, 10.0, 1.2, 80.0, 1.0)
+SIGNS = Signs(300.0, 150.0, 0.0, 1.4, 0.8, 10.0, 1.2, 80.0, 1.0)
 
 
 def changed(changes):
@@ -168,6 +168,7 @@ def changed(changes):
     [
         ({}, "single"),
         ({"lead": 20.0}, "none"),
+        ({"lead": 20.0, "before": 1.5}, "unknown"),
         ({"lead": 20.0, "structure_after": 9.0}, "unknown"),
         ({"lead": 5.0, "whole": 9.0}, "unknown"),
         ({"structure_after": 40.0, "after": 5.0}, "unknown"),
@@ -284,6 +285,7 @@ def test_poses_may_err_smoothly_and_more_than_their_noise_says(changes):
         ({"after": 5.0}, True),
         ({"lead": 20.0, "held_out": 0.0}, True),
         ({"lead": 20.0, "held_out": 9.0}, False),
+        ({"lead": 20.0, "held_out": 0.0, "before": 1.5}, False),
     ],
 )
 def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, likely):
