@@ -18,7 +18,7 @@ from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import HeldOut, held_out
 from mjx_refine.diagnosis.knock import strike_notes
 from mjx_refine.diagnosis.measure import Measured, measure
-from mjx_refine.diagnosis.mismatch import matched
+from mjx_refine.diagnosis.mismatch import matched, moved_by
 from mjx_refine.diagnosis.numbers import tied, values_at
 from mjx_refine.diagnosis.replay import Replay, replays
 from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Verdict
@@ -119,7 +119,9 @@ def _diagnosed(
     told("report")
     result = _result(clip, compared, outside_of, found, said, problem, observation, start.matching, seed, began)
     # What moves is not all that there is: without masks nobody knows what should overlap.
-    return result if observation.masks is None else matched(result)
+    if observation.masks is None:
+        return result
+    return matched(result, moved_by([compared.base, *([best.fit] if best else [])]))
 
 
 def prepared(scene: Scene, observation: Observation, threads: int | None) -> tuple[Problem, Start, Measured]:

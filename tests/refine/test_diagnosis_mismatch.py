@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from test_diagnose_report import made_up
 
-from mjx_refine.diagnosis.mismatch import MATCHES, matched
+from mjx_refine.diagnosis.mismatch import FAR, MATCHES, matched, moved_by
 from mjx_refine.diagnosis.result import UNKNOWN
 
 
@@ -20,12 +23,12 @@ def _reaching(before: float, after: float):
 @pytest.mark.parametrize(("before", "after"), [(0.2, 0.9), (0.9, 0.2), (MATCHES, 0.0), (math.nan, math.nan)])
 def test_a_scene_that_replays_its_clip_is_diagnosed(before, after):
     found = _reaching(before, after)
-    assert matched(found) is found
+    assert matched(found, FAR) is found
 
 
 def test_nothing_is_named_where_neither_scene_replays_the_clip():
     found = _reaching(0.37, 0.28)
-    told = matched(found)
+    told = matched(found, 0.5)
     assert told.verdict.effects == UNKNOWN
     assert "Cannot tell" in told.verdict.sentence
     assert "0.37" in told.verdict.sentence
@@ -33,3 +36,20 @@ def test_nothing_is_named_where_neither_scene_replays_the_clip():
     assert (told.gap.after, told.gap.closed, told.gap.iou_after) == (found.gap.before, 0.0, 0.37)
     assert max(one.probability for one in told.candidates) < 0.5
     assert told.remaining == found.residual
+
+
+def test_nothing_is_named_where_only_another_scene_replays_the_clip():
+    found = _reaching(0.82, 0.83)
+    told = matched(found, FAR + 4.0)
+    assert told.verdict.effects == UNKNOWN
+    assert "Cannot tell" in told.verdict.sentence
+    assert "10.0 times" in told.verdict.sentence
+    assert told.scene == found.base
+
+
+def test_how_far_numbers_moved_is_of_the_fit_that_moves_them_least_and_of_ordinary_ones():
+    def fit(*z) -> Any:
+        return SimpleNamespace(z=np.array(z), hypothesis=SimpleNamespace(space=SimpleNamespace(dimension=2)))
+
+    assert moved_by([fit(3.0, 4.0)]) == pytest.approx(math.sqrt(12.5))
+    assert moved_by([fit(3.0, 4.0), fit(1.0, 1.0, 90.0)]) == pytest.approx(1.0)
