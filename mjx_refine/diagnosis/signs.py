@@ -22,6 +22,10 @@ UNMISTAKABLE, BY_FAR = ("dropped_frames", "mask_bias", "occluder"), 100.0
 withheld exams one of these led every other by so much on 36 clips, and was at work on all of them, alone on 27; six of these
 had been ``unknown``, since masks that are too thin, what stands before objects, and frames around a gap leave more than noise."""
 
+UNSEEN_THINGS = ("hidden_obstacle",)
+"""Effects of things that nobody sees, whose form and stuff are their own: contacts with them leave what a simple form does not
+tell."""
+
 TILTS = ("camera_roll", "slope")
 """Effects that tilt the world, which velocities, poses and the camera's height imitate so well that little of the gap is left to
 be closed."""
@@ -56,6 +60,7 @@ class Signs:
       unmistakable: 1 where the best single effect is one that nothing else looks like, and leads every other by far.
       pliant: 1 where the best single effect is one that bends to many others.
       tilted: 1 where the best single effect is one that tilts the world.
+      touched: 1 where the best single effect is of a thing that nobody sees.
       unnamed: gain in evidence of a force of any course over the best hypothesis; 0 where that was not asked.
       aloft: 1 where that force's object is in the air for most of the time.
       background: mean square residual of the background's flow that the best hypothesis leaves, noise widths squared.
@@ -83,6 +88,7 @@ class Signs:
     drawn: float = 0.0
     forces: float = 0.0
     tilted: float = 0.0
+    touched: float = 0.0
 
 
 def signs(clip: ClipFit, compared: Compared, held_out: float, closed: float = 1.0) -> Signs:
@@ -111,6 +117,7 @@ def signs(clip: ClipFit, compared: Compared, held_out: float, closed: float = 1.
         unmistakable=float(first is not None and first.names[0] in UNMISTAKABLE and margin > BY_FAR),
         pliant=float(first is not None and first.names[0] in PLIANT),
         tilted=float(bool(first) and first.names[0] in TILTS),
+        touched=float(bool(first) and first.names[0] in UNSEEN_THINGS),
         unnamed=(freed.fit.evidence - after.evidence) / unit if freed else 0.0,
         aloft=float(freed is not None and freed.on_floor < MOSTLY),
         background=unsteadiness(clip, after),

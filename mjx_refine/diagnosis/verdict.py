@@ -114,6 +114,11 @@ WHOLLY = 0.85
 """Part of the gap on frames that no fit has seen from which what bends to many others may leave what any effect may: of five such
 clips of seeds 25 to 29, which had been ``unknown``, it is at work on four (closing 0.87 to 0.99), and a wind on one."""
 
+LOST = 0.0
+"""Gain of a force of any course below which an obstacle that closes that much may leave what any form of it may: of four such
+clips of seeds 22 to 30, all of them ``unknown``, a force loses on two, on which an obstacle is at work, and gains on two, on
+which something else is."""
+
 LOOSE, LOOSER, NEARLY = 1.5, 3.2, 0.8
 """Structure of the residuals above which not both of two effects are named; the same where they close this part of the gap on
 frames that no fit has seen: of twos of seed 12 with a structure between these, two right ones closed 0.83 and 0.98, wrong ones
@@ -309,6 +314,8 @@ def _allowed(told: Signs, paired: bool, video: bool) -> float:
     allowed = STRANGE * (1 + max(told.margin, 0.0) / CLEAR)
     if not video:
         return allowed
+    if told.touched and told.closed >= WHOLLY and told.unnamed < LOST:
+        return np.inf
     if told.pliant and told.unnamed > -TURNS * told.lead and told.closed < WHOLLY:
         return BENT
     # What no contact imitates may leave what contacts that err leave.
