@@ -42,13 +42,13 @@ def _crossings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis,
     if not starts:
         return []
     terms = [term_of("friction_patch", -1, start, clip.frames) for start in starts]
-    nothing = np.zeros(len(terms[0].centre))
+    owns, nothing = terms[0].at(np.array([one.centre for one in terms])), np.zeros(len(terms[0].centre))
     found = []
     # A push that ended badly has bent the ordinary numbers, and the given scene's are bent by nothing.
     plain = rest.space.dimension
     beside = fit.z[plain : rest.dimension]
     for ground in (fit.z[: rest.dimension], np.concatenate([np.zeros(plain), beside])):
-        at = [np.concatenate([ground, own]) for own in terms[0].at(np.array([start.values for start in starts]))]
+        at = [np.concatenate([ground, own]) for own in owns]
         white, costs = clip.residuals(rest.added(terms[0]), np.array(at))
         # Without the prior, which is the first one's.
         left = np.where(np.isfinite(costs), (white**2).sum(1), np.inf)

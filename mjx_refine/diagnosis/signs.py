@@ -10,6 +10,7 @@ import numpy as np
 from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared
 from mjx_refine.diagnosis.fit import ClipFit
 from mjx_refine.diagnosis.where import background_energy, misfit_map
+from mjx_refine.effects import acting_kind
 
 INIMITABLE = ("camera_motion", "camera_shake", "lens_distortion", "rolling_shutter")
 """Effects that contacts which err do not imitate."""
@@ -21,10 +22,6 @@ UNMISTAKABLE, BY_FAR = ("dropped_frames", "mask_bias", "occluder"), 100.0
 """Effects that nothing else looks like, and the margin from which they are named whatever they leave: on seeds 10 to 14 of the
 withheld exams one of these led every other by so much on 36 clips, and was at work on all of them, alone on 27; six of these
 had been ``unknown``, since masks that are too thin, what stands before objects, and frames around a gap leave more than noise."""
-
-UNSEEN_THINGS = ("hidden_obstacle",)
-"""Effects of things that nobody sees, whose form and stuff are their own: contacts with them leave what a simple form does not
-tell."""
 
 TILTS = ("camera_roll", "slope")
 """Effects that tilt the world, which velocities, poses and the camera's height imitate so well that little of the gap is left to
@@ -60,7 +57,7 @@ class Signs:
       unmistakable: 1 where the best single effect is one that nothing else looks like, and leads every other by far.
       pliant: 1 where the best single effect is one that bends to many others.
       tilted: 1 where the best single effect is one that tilts the world.
-      touched: 1 where the best single effect is of a thing that nobody sees.
+      touched: 1 where the best single effect strikes: it is of a thing that nobody sees, whose form is its own.
       unnamed: gain in evidence of a force of any course over the best hypothesis; 0 where that was not asked.
       aloft: 1 where that force's object is in the air for most of the time.
       background: mean square residual of the background's flow that the best hypothesis leaves, noise widths squared.
@@ -117,7 +114,7 @@ def signs(clip: ClipFit, compared: Compared, held_out: float, closed: float = 1.
         unmistakable=float(first is not None and first.names[0] in UNMISTAKABLE and margin > BY_FAR),
         pliant=float(first is not None and first.names[0] in PLIANT),
         tilted=float(bool(first) and first.names[0] in TILTS),
-        touched=float(bool(first) and first.names[0] in UNSEEN_THINGS),
+        touched=float(bool(first) and acting_kind(first.names[0]).strikes),
         unnamed=(freed.fit.evidence - after.evidence) / unit if freed else 0.0,
         aloft=float(freed is not None and freed.on_floor < MOSTLY),
         background=unsteadiness(clip, after),

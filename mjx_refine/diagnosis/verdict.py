@@ -112,12 +112,10 @@ one leaves whose form is not quite right. On seeds 13 to 22 of the withheld exam
 
 WHOLLY = 0.85
 """Part of the gap on frames that no fit has seen from which what bends to many others may leave what any effect may: of five such
-clips of seeds 25 to 29, which had been ``unknown``, it is at work on four (closing 0.87 to 0.99), and a wind on one."""
-
-LOST = 0.0
-"""Gain of a force of any course below which an obstacle that closes that much may leave what any form of it may: of four such
-clips of seeds 22 to 30, all of them ``unknown``, a force loses on two, on which an obstacle is at work, and gains on two, on
-which something else is."""
+clips of seeds 25 to 29, which had been ``unknown``, it is at work on four (closing 0.87 to 0.99), and a wind on one. An obstacle
+that closes so much may leave anything, as any form of it may, unless a force of any course gains: of four such clips of seeds 22
+to 30, all of them ``unknown``, a force loses on two, on which an obstacle is at work, and gains on two, on which something else
+is."""
 
 LOOSE, LOOSER, NEARLY = 1.5, 3.2, 0.8
 """Structure of the residuals above which not both of two effects are named; the same where they close this part of the gap on
@@ -237,7 +235,7 @@ def _answered(told: Signs, shares: tuple[float, ...], video: bool) -> Answer:
         if video and told.pair > told.lead and told.lead + told.pair > TOGETHER:
             return levels.unknown(shares)
         if video and told.before > ABOVE_NOISE:
-            return dataclasses.replace(levels.unknown(shares), probability=UNLIKELY)
+            return Answer("unknown", UNLIKELY, shares, levels.at_work["unknown"])
         if told.held_out > UNSEEN:
             return Answer("none", UNLIKELY, shares, levels.at_work["perhaps none"])
         return Answer("none", levels.likely, shares, levels.at_work["none"])
@@ -314,7 +312,7 @@ def _allowed(told: Signs, paired: bool, video: bool) -> float:
     allowed = STRANGE * (1 + max(told.margin, 0.0) / CLEAR)
     if not video:
         return allowed
-    if told.touched and told.closed >= WHOLLY and told.unnamed < LOST:
+    if told.touched and told.closed >= WHOLLY and told.unnamed < 0:
         return np.inf
     if told.pliant and told.unnamed > -TURNS * told.lead and told.closed < WHOLLY:
         return BENT
