@@ -1,20 +1,26 @@
-"""Objects that never meet: one rollout tells derivatives by a number of each (Curtis, Powell and Reid 1974)."""
+"""Which numbers share a rollout that tells derivatives: those of objects that never meet, and those of stretches of a path that
+nodes keep apart, since what one changes the other does not (Curtis, Powell and Reid 1974)."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
-from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.hypothesis import WHOLE, Hypothesis
+from mjx_refine.diagnosis.nodes import missed_by
 from mjx_refine.sim.model import model_fields
 
-Shot = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Points, one a row, to poses and what paths miss."""
+Flight = tuple[Float[np.ndarray, "rows frames objects 7"], Float[np.ndarray, "rows nodes 13"]]
+"""Poses, and the states in which paths arrive at nodes."""
+
+Fly = Callable[[np.ndarray], Flight]
+"""Points, one a row, to what is simulated there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +50,7 @@ def beside(
     hypothesis: Hypothesis,
     z: Float[np.ndarray, "dimension"],
     step: Float[np.ndarray, "dimension"],
-    shot: Shot,
+    fly: Fly,
 ) -> Beside:
     """Points beside ``z``, by a step along each coordinate; of objects that do not meet in any of them, several at once.
 
@@ -52,29 +58,63 @@ def beside(
       hypothesis: whose coordinates they are.
       z: the point.
       step: of each coordinate.
-      shot: rollouts at points, one a row, and by how much their paths miss the next ones' begin.
+      fly: simulates points, one a row.
     """
-    still, missed = shot(z[None])
-    met = _meetings(hypothesis, z[None], still) | hypothesis.couples
-    rows = moved_together(hypothesis.owners, companies(met), hypothesis.moves)
-    points, poses, away = _rolled(hypothesis, z, rows * step, (still, missed), shot)
-    company = companies(met | _meetings(hypothesis, points, poses))
-    if len(rows) < len(z) and (company != companies(met)).any():
-        rows = moved_together(hypothesis.owners, np.zeros_like(company), hypothesis.moves)
-        points, poses, away = _rolled(hypothesis, z, rows * step, (still, missed), shot)
+    still = fly(z[None])
+    met = _meetings(hypothesis, z[None], still[0]) | hypothesis.couples
+    rows, shared = _shared(hypothesis, companies(met))
+    points, flown = _flown(hypothesis, z, shared * step, still, fly)
+    company = companies(met | _meetings(hypothesis, points, flown[0]))
+    if len(shared) < len(z) and (company != companies(met)).any():
+        rows, shared = _shared(hypothesis, np.zeros_like(company))
+        points, flown = _flown(hypothesis, z, shared * step, still, fly)
+        company = np.zeros_like(company)
+    if len(shared) < len(rows):
+        points = np.clip(z + rows * step, *hypothesis.bounds)
+        flown = _told_apart(hypothesis, company, rows, shared, still, flown)
     row = rows.argmax(0)
     alone = rows.sum(1)[row] == 1
     felt = alone[:, None] | (company[hypothesis.owners][:, None] == np.append(company, -1))
-    both = [np.concatenate(two) for two in ((z[None], points), (still, poses), (missed, away))]
-    return Beside(both[0], both[1], both[2], 1 + row, felt)
+    points, poses, arrived = (np.concatenate(two) for two in zip((z[None], *still), (points, *flown), strict=True))
+    missed = missed_by(hypothesis.nodes, arrived, hypothesis.batch(points).restarts)
+    return Beside(points, poses, missed, 1 + row, felt)
 
 
-def _rolled(hypothesis: Hypothesis, z: np.ndarray, steps: np.ndarray, still: tuple[np.ndarray, np.ndarray], shot: Shot):
-    points, (poses, missed) = np.clip(z + steps, *hypothesis.bounds), (np.repeat(s, len(steps), 0) for s in still)
+def _shared(hypothesis: Hypothesis, company: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Which coordinates are moved at each point at which residuals are asked for, and which in each rollout."""
+    owners, moves = hypothesis.owners, hypothesis.moves
+    whole = np.full(len(owners), WHOLE)
+    rows = moved_together(owners, company, moves, whole)
+    # What is shown twice may be of two stretches.
+    if not hypothesis.nodes or any(t.kind.retimes for t in hypothesis.terms):
+        return rows, rows
+    by_itself = np.isin(company, np.nonzero(np.bincount(company) == 1)[0])
+    stretches = np.where((owners >= 0) & by_itself[owners], hypothesis.stretches, whole)
+    return rows, moved_together(owners, company, moves, stretches)
+
+
+def _flown(hypothesis: Hypothesis, z: np.ndarray, steps: np.ndarray, still: Flight, fly: Fly):
+    points, (poses, arrived) = np.clip(z + steps, *hypothesis.bounds), (np.repeat(s, len(steps), 0) for s in still)
     moves = (steps[:, hypothesis.moves] != 0).any(1)
     if moves.any():
-        poses[moves], missed[moves] = shot(points[moves])
-    return points, poses, missed
+        poses[moves], arrived[moves] = fly(points[moves])
+    return points, (poses, arrived)
+
+
+def _told_apart(
+    hypothesis: Hypothesis, company: np.ndarray, rows: np.ndarray, shared: np.ndarray, still: Flight, flown: Flight
+) -> Flight:
+    """What would have been simulated at points where coordinates are moved as in ``rows``, from rollouts in which more were."""
+    owners, stretches, nodes = hypothesis.owners, hypothesis.stretches, hypothesis.nodes
+    poses, arrived = (np.repeat(s, len(rows), 0) for s in still)
+    for coordinate, (row, rollout) in enumerate(zip(rows.argmax(0), shared.argmax(0), strict=True)):
+        owner, stretch = owners[coordinate], stretches[coordinate]
+        felt = company == company[owner] if owner >= 0 else np.ones(len(company), bool)
+        begin, end = hypothesis.frames_of(owner, stretch if felt.sum() == 1 else WHOLE, poses.shape[1])
+        poses[row, begin:end, felt] = flown[0][rollout, begin:end, felt]
+        ends = [k for k, node in enumerate(nodes) if felt[node.target] and begin < node.frame <= end]
+        arrived[row, ends] = flown[1][rollout, ends]
+    return poses, arrived
 
 
 def _meetings(hypothesis: Hypothesis, points: np.ndarray, poses: np.ndarray) -> Bool[np.ndarray, "objects objects"]:
@@ -101,7 +141,10 @@ def companies(met: Bool[np.ndarray, "objects objects"]) -> Int[np.ndarray, "obje
 
 
 def moved_together(
-    owner: Int[np.ndarray, "dimension"], company: Int[np.ndarray, "objects"], moves: Bool[np.ndarray, "dimension"]
+    owner: Int[np.ndarray, "dimension"],
+    company: Int[np.ndarray, "objects"],
+    moves: Bool[np.ndarray, "dimension"],
+    stretch: Int[np.ndarray, "dimension"],
 ) -> Bool[np.ndarray, "rows dimension"]:
     """Which coordinates are moved in each candidate, every one in exactly one.
 
@@ -109,14 +152,23 @@ def moved_together(
       owner: the object that each coordinate is of; -1: of none alone.
       company: of each object.
       moves: which coordinates change the rollout: those go together, so that few rollouts are needed.
+      stretch: of its object's path that each coordinate changes alone, several of which go together; ``WHOLE``: all of it.
     """
-    alone = [[k] for k in np.nonzero(owner < 0)[0]]
-    queues = [
-        sorted(np.nonzero((owner >= 0) & (company[owner] == c))[0], key=lambda k: not moves[k])
-        for c in range(int(company.max()) + 1)
-    ]
-    rows = alone + [[k for k in row if k is not None] for row in itertools.zip_longest(*queues)]
+    rows = [[k] for k in np.nonzero(owner < 0)[0]]
+    queues: list[list[list[int]]] = []
+    for c in range(int(company.max()) + 1):
+        mine = sorted(np.nonzero((owner >= 0) & (company[owner] == c))[0], key=lambda k: not moves[k])
+        parts = [[k for k in mine if stretch[k] == part] for part in range(int(stretch.max(initial=WHOLE)) + 1)]
+        queues.append(
+            sorted(_side_by_side(parts) + [[k] for k in mine if stretch[k] == WHOLE], key=lambda r: not moves[r[0]])
+        )
+    rows += [[k for part in row for k in part] for row in _side_by_side(queues)]
     told = np.zeros((len(rows), len(owner)), bool)
     for row, columns in zip(told, rows, strict=True):
         row[columns] = True
     return told
+
+
+def _side_by_side(queues: list[list[Any]]) -> list[list[Any]]:
+    """The first of each, the second of each that has one, ..."""
+    return [[one for one in row if one is not None] for row in itertools.zip_longest(*queues)]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mjx_refine.batch import SceneBatch
-from mjx_refine.diagnosis.apart import beside
+from mjx_refine.diagnosis.apart import Flight, beside
 from mjx_refine.diagnosis.chaos import EXCUSED, believed, drawn, jaggedness
 from mjx_refine.diagnosis.crew import Crew
 from mjx_refine.diagnosis.drawn_along import always_off
@@ -284,32 +284,31 @@ class ClipFit:
         self.rollouts += len(batch) * frames / self.frames
         return self.simulator.rollout(batch, frames)
 
+    def flown(self, batch: SceneBatch, keep: np.ndarray | None = None) -> Flight:
+        """Rollouts, counted, and the states in which paths arrive at nodes; after what is kept, all stands still."""
+        needed = self.frames if keep is None else min(int(np.flatnonzero(keep)[-1]) + 2, self.frames)
+        if batch.restarts:
+            self.rollouts += len(batch) * needed / self.frames
+            poses, arrived = self.simulator.shot(batch, needed)
+        else:
+            poses, arrived = self.rollout(batch, needed), np.zeros((len(batch), 0, 13))
+        return np.concatenate([poses, np.repeat(poses[:, -1:], self.frames - needed, 1)], 1), arrived
+
     def poses(self, hypothesis: Hypothesis, z: np.ndarray, keep: np.ndarray | None = None) -> np.ndarray:
-        """Rollouts at the rows of ``z``; after what is kept, all stands still."""
-        return self.shot(hypothesis, z, keep)[0]
+        """Paths at the rows of ``z``."""
+        return self.flown(hypothesis.batch(z), keep)[0]
 
     def shot(
-        self, hypothesis: Hypothesis, z: np.ndarray, keep: np.ndarray | None = None
+        self, hypothesis: Hypothesis, batch: SceneBatch, keep: np.ndarray | None = None
     ) -> tuple[Float[np.ndarray, "batch frames objects 7"], Float[np.ndarray, "batch missed"]]:
-        """As ``poses``, and by how much paths miss the begin of those after nodes [deviations]."""
-        needed = self.frames if keep is None else min(int(np.flatnonzero(keep)[-1]) + 2, self.frames)
-        told, missed = self.shot_of(hypothesis, hypothesis.batch(z), needed)
-        return np.concatenate([told, np.repeat(told[:, -1:], self.frames - needed, 1)], 1), missed
-
-    def shot_of(
-        self, hypothesis: Hypothesis, batch: SceneBatch, frames: int
-    ) -> tuple[Float[np.ndarray, "batch frames objects 7"], Float[np.ndarray, "batch missed"]]:
-        """The same of candidates, and of so many frames."""
-        if not hypothesis.nodes:
-            return self.rollout(batch, frames), np.zeros((len(batch), 0))
-        self.rollouts += len(batch) * frames / self.frames
-        poses, arrived = self.simulator.shot(batch, frames)
+        """Paths of candidates, and by how much they miss the begin of those after nodes [deviations]."""
+        poses, arrived = self.flown(batch, keep)
         return poses, missed_by(hypothesis.nodes, arrived, batch.restarts)
 
     def residuals(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE):
         """(residuals (B, R), half their sum of squares with the prior (B,))."""
-        poses, missed = self.shot(hypothesis, z, keep)
-        prediction = self.predictor(poses, hypothesis.batch(z))
+        poses, missed = self.shot(hypothesis, batch := hypothesis.batch(z), keep)
+        prediction = self.predictor(poses, batch)
         white = np.concatenate([self.whitened(self.distances(prediction), keep, scale, hypothesis), missed], 1)
         cost = 0.5 * (white**2).sum(1) + 0.5 * (prior(hypothesis, z)[0] ** 2).sum(1)
         return white, np.where(prediction.bad, np.inf, cost)
@@ -317,7 +316,7 @@ class ClipFit:
     def jacobian(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE, size=STEPS[0]):
         """d residuals / d z (R, D) by differences towards the inside of the bounds."""
         step = np.where(z + size > hypothesis.bounds[1], -size, size)
-        told = beside(hypothesis, z, step, functools.partial(self.shot, hypothesis, keep=keep))
+        told = beside(hypothesis, z, step, lambda points: self.flown(hypothesis.batch(points), keep))
         prediction = self.predictor(told.poses, hypothesis.batch(told.points))
         white = self.rigid(self.distances(prediction), keep, scale)
         change = np.where(told.felt[:, self.measured.objects], white[told.row] - white[0], 0.0)

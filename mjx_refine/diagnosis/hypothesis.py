@@ -27,6 +27,12 @@ off: with numbers 19 and 29 widths off two cylinders that met obstacles (seed 18
 FARTHEST = 60.0
 """Bounds of nodes' coordinates, in their units."""
 
+BEGIN = ("position", "clearance", "yaw", "tilt", "lean", "linear_velocity", "spin")
+"""Fields that tell how an object begins."""
+
+WHOLE = -1
+"""The stretch of a coordinate that changes all of a path."""
+
 SMALL = 1e-4
 """Prior widths by which coordinates are moved to see what that does to an effect's numbers."""
 
@@ -192,6 +198,21 @@ class Hypothesis:
         """The object that each coordinate is of, -1 where it is of none alone."""
         told = [p.index[0] for p in self.space.parameters] + [n.target for n in self.nodes for _ in range(COORDINATES)]
         return np.array(told + [t.target for t in self.terms for _ in range(int(t.free.sum()))], int)
+
+    @functools.cached_property
+    def stretches(self) -> Int[np.ndarray, "dimension"]:
+        """Which stretch of its object's path each coordinate changes alone: 0 until the first node, 1 until the next, ...;
+        ``WHOLE``: all of it."""
+        told = [0 if p.field in BEGIN else WHOLE for p in self.space.parameters]
+        for node in self.nodes:
+            before = sum(n.target == node.target and n.frame <= node.frame for n in self.nodes)
+            told += [before] * COORDINATES
+        return np.array(told + [WHOLE] * (self.dimension - len(told)), int)
+
+    def frames_of(self, target: int, stretch: int, frames: int) -> tuple[int, int]:
+        """The first frame of a stretch of an object's path, and the first of the next one, or how many there are."""
+        ends = [0, *sorted(n.frame for n in self.nodes if n.target == target), frames]
+        return (0, frames) if stretch == WHOLE else (ends[stretch], ends[stretch + 1])
 
     @property
     def price(self) -> float:

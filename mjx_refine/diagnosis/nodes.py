@@ -88,7 +88,8 @@ def missed_by(
 ) -> Float[np.ndarray, "batch missed"]:
     """``Node.missed`` of all, side by side."""
     each = enumerate(zip(nodes, begun, strict=True))
-    return np.concatenate([node.missed(arrived[:, k], one.state) for k, (node, one) in each], 1)
+    told = [node.missed(arrived[:, k], one.state) for k, (node, one) in each]
+    return np.concatenate(told, 1) if told else np.zeros((len(arrived), 0))
 
 
 def missing(nodes: Sequence[Node]) -> Int[np.ndarray, "missed"]:

@@ -153,7 +153,7 @@ class Screen:
         # A slope carries its objects along; its batch must be made with its values.
         batch = hypothesis.batch_with(z, effects)
         if acts:
-            poses, missed = self.clip.shot_of(hypothesis, batch, self.clip.frames)
+            poses, missed = self.clip.shot(hypothesis, batch)
         else:
             poses = np.repeat(self.poses, len(z), 0)
             missed = np.repeat(self.fit.residual[None, len(self.clip.known(self.fit)) :], len(z), 0)

@@ -1,11 +1,14 @@
 """Objects that do not meet are moved in the same rollouts, and derivatives stay what they are."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from mjx_refine.diagnosis import apart
 from mjx_refine.diagnosis.apart import beside, companies, meetings, moved_together
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.hypothesis import WHOLE, Hypothesis, term
+from mjx_refine.diagnosis.nodes import Node, missed_by, missing
 from mjx_refine.effects.magnus import Magnus
 from mjx_refine.scene import Body, Camera, Scene
 from mjx_refine.sim.c import MujocoSimulator
@@ -43,7 +46,7 @@ def test_who_meets_a_third_is_of_one_company():
 def test_every_coordinate_is_moved_once_and_companies_never_twice_in_a_row():
     owner = np.array([-1, 0, 0, 0, 1, 1, 2, -1])
     moves = np.array([1, 0, 1, 1, 1, 0, 1, 0], bool)
-    rows = moved_together(owner, np.array([0, 1, 1]), moves)
+    rows = moved_together(owner, np.array([0, 1, 1]), moves, np.full(8, WHOLE))
     assert (rows.sum(0) == 1).all()
     assert len(rows) == 2 + 3
     for row in rows:
@@ -69,7 +72,7 @@ def test_rollouts_are_shared_only_where_objects_do_not_meet(distance, fewer):
 
     def shot(points):
         asked.append(len(points))
-        return simulator.rollout(hypothesis.batch(points), 12), np.zeros((len(points), 0))
+        return simulator.rollout(hypothesis.batch(points), 12), np.zeros((len(points), 0, 13))
 
     z, step = np.zeros(hypothesis.dimension), np.full(hypothesis.dimension, 0.01)
     told = beside(hypothesis, z, step, shot)
@@ -82,6 +85,46 @@ def test_rollouts_are_shared_only_where_objects_do_not_meet(distance, fewer):
         assert found == pytest.approx(wanted, abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("distance", "effect"), [(1.5, "magnus"), (1.5, "slope"), (0.35, "magnus"), (1.5, "dropped_frames")]
+)
+def test_stretches_that_nodes_keep_apart_share_rollouts(distance, effect):
+    one = scene(distance)
+    state = np.array([0.3, 0, 0.9, 1, 0, 0, 0, 0.2, 0.1, 1.0, 1.0, 2.0, 0.5])
+    nodes = [
+        Node(target, frame, state + target * distance * np.eye(13)[0], np.full(12, 0.1), ()) for target, frame in NODES
+    ]
+    start = np.array([5.0, 1.0]) if effect == "dropped_frames" else None
+    extra = term(effect, 0 if effect == "magnus" else -1, FRAMES, start)
+    hypothesis = dataclasses.replace(Hypothesis(Space.around(one)), nodes=tuple(nodes)).added(extra)
+    simulator, asked = MujocoSimulator(one.shapes, 30.0, 1), []
+
+    def fly(points):
+        asked.append(len(points))
+        return simulator.shot(hypothesis.batch(points), FRAMES)
+
+    z, step = np.zeros(hypothesis.dimension), np.full(hypothesis.dimension, 0.01)
+    told = beside(hypothesis, z, step, fly)
+    # Of each object: its own numbers, and twelve of its state at a time.
+    most = 1 + np.sum(hypothesis.owners < 0) + 12 + 7
+    assert (sum(asked) <= most) == (distance == 1.5 and effect != "dropped_frames")
+    change = told.change_of_missed(missing(hypothesis.nodes))
+    (still,), (begun,) = fly(z[None])[0], missed_of(hypothesis, z, fly)
+    for k in range(hypothesis.dimension):
+        alone = z.copy()
+        alone[k] += step[k]
+        found = np.where(told.felt[k, :2, None], told.poses[told.row[k]], still)
+        assert found == pytest.approx(fly(alone[None])[0][0], abs=1e-8)
+        assert change[k] == pytest.approx(missed_of(hypothesis, alone, fly)[0] - begun, abs=1e-6)
+
+
+NODES, FRAMES = ((0, 4), (1, 6), (0, 8)), 12
+
+
+def missed_of(hypothesis, z, fly):
+    return missed_by(hypothesis.nodes, fly(z[None])[1], hypothesis.batch(z[None]).restarts)
+
+
 def test_effects_that_couple_objects_keep_rollouts_apart(monkeypatch):
     one = scene(1.5)
     hypothesis = Hypothesis(Space.around(one)).added(term("magnus", 0, 12))
@@ -89,7 +132,10 @@ def test_effects_that_couple_objects_keep_rollouts_apart(monkeypatch):
     monkeypatch.setattr(Magnus, "couples", True)
     z = np.zeros(hypothesis.dimension)
     told = beside(
-        hypothesis, z, z + 0.01, lambda points: (simulator.rollout(hypothesis.batch(points), 12), points[:, :0])
+        hypothesis,
+        z,
+        z + 0.01,
+        lambda points: (simulator.rollout(hypothesis.batch(points), 12), np.zeros((len(points), 0, 13))),
     )
     assert len(told.points) == 1 + hypothesis.dimension
     assert told.felt.all()
@@ -102,7 +148,7 @@ def test_where_a_moved_object_meets_another_rollouts_are_made_again(monkeypatch)
 
     def shot(points):
         asked.append(len(points))
-        return simulator.rollout(hypothesis.batch(points), 12), np.zeros((len(points), 0))
+        return simulator.rollout(hypothesis.batch(points), 12), np.zeros((len(points), 0, 13))
 
     told = iter([np.zeros((2, 2), bool), ~np.eye(2, dtype=bool)])
     monkeypatch.setattr(apart, "meetings", lambda poses, radius: next(told))

@@ -133,7 +133,7 @@ def test_a_path_has_a_node_in_the_air_after_its_impact(bounced):
     assert max(i.frame for i in node.struck) < node.frame <= clip.frames - LEAST_LEFT
     assert missing(there.hypothesis.nodes).tolist() == [0] * COORDINATES
     # The state is told by differences of poses, which the air does not disturb.
-    at = clip.shot(there.hypothesis, there.z[None])[1]
+    at = clip.shot(there.hypothesis, there.hypothesis.batch(there.z[None]))[1]
     assert np.abs(at).max() < 1.0
 
 
@@ -158,7 +158,7 @@ def test_derivatives_by_states_are_those_of_residuals(bounced):
     z = np.concatenate([there.z, np.full(2, 0.1)])
     jacobian, still = clip.jacobian(hypothesis, z), clip.residuals(hypothesis, z[None])[0][0]
     assert jacobian.shape == (len(still), len(z))
-    for k in (0, hypothesis.space.dimension, hypothesis.space.dimension + 7, len(z) - 1):
+    for k in range(len(z)):
         moved = z.copy()
         moved[k] += 0.002
         change = (clip.residuals(hypothesis, moved[None])[0][0] - still) / 0.002
