@@ -8,17 +8,14 @@ from jaxtyping import Float
 
 def multiply(p: Float[np.ndarray, "*batch 4"], q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]:
     """Hamilton product: first ``q``, then ``p``."""
-    a, b, c, d = np.moveaxis(p, -1, 0)
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    return np.stack(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ],
-        -1,
-    )
+    a, b, c, d = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    result = np.empty(np.broadcast_shapes(p.shape, q.shape), np.result_type(p, q))
+    result[..., 0] = a * w - b * x - c * y - d * z
+    result[..., 1] = a * x + b * w + c * z - d * y
+    result[..., 2] = a * y - b * z + c * w + d * x
+    result[..., 3] = a * z + b * y - c * x + d * w
+    return result
 
 
 def exponential(vector: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 4"]:
@@ -57,6 +54,12 @@ def conjugate(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]
 def normalise(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]:
     """Unit quaternions of the same direction."""
     return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def length(v: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
+    """``np.linalg.norm`` of few vectors, in less time."""
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    return np.sqrt(x * x + y * y + z * z)
 
 
 def cross(a: Float[np.ndarray, "*batch 3"], b: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from mjx_refine import rotations
 from mjx_refine.batch import BatchEffect, SceneBatch, batch_from_scenes
-from mjx_refine.effects.kind import EffectKind, Loads, Motion, OutlineView
+from mjx_refine.effects.kind import EffectKind, OutlineView
 from mjx_refine.effects.registry import acting_kind, kind_of
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Effect, Scene
@@ -71,61 +71,20 @@ def effect_entry(kind: EffectKind, target: str | None, values: Float[np.ndarray,
     return Effect(kind.name, target, tuple(kind.unpack(values, frames).items()))
 
 
-def _acting(batch: SceneBatch) -> Iterator[tuple[EffectKind, BatchEffect]]:
+def acting_in(batch: SceneBatch) -> Iterator[tuple[EffectKind, BatchEffect]]:
+    """The batch's effects, each with its kind."""
     for effect in batch.effects:
         yield acting_kind(effect.name), effect
 
 
 def is_physical(batch: SceneBatch) -> bool:
     """Whether an effect of the batch acts in the rollout itself."""
-    return any(kind.physical for kind, _ in _acting(batch))
-
-
-def has_loads(batch: SceneBatch) -> bool:
-    """Whether an effect needs a look at the state in every step."""
-    return bool(with_loads(batch))
-
-
-def with_loads(batch: SceneBatch) -> tuple[str, ...]:
-    """Names of the effects that need a look at the state in every step."""
-    return tuple(
-        kind.name
-        for kind, _ in _acting(batch)
-        if type(kind).loads is not EffectKind.loads or type(kind).floor_friction is not EffectKind.floor_friction
-    )
-
-
-def loads(batch: SceneBatch, motion: Motion) -> Loads | None:
-    """Forces and torques of all effects at one instant, or None where there are none."""
-    told = [kind.loads(motion, effect.target, effect.values) for kind, effect in _acting(batch)]
-    found = [one for one in told if one is not None]
-    if not found:
-        return None
-    return sum(force for force, _ in found), sum(torque for _, torque in found)  # type: ignore[return-value]
-
-
-def idle(batch: SceneBatch, motion: Motion) -> float:
-    """For how long the loads and the floor's friction surely stay as they are [s]."""
-    named = with_loads(batch)
-    told = [k.idle(motion, e.target, e.values) for k, e in _acting(batch) if k.name in named]
-    return float(np.min(told, initial=np.inf))
-
-
-def floor_friction(batch: SceneBatch, motion: Motion) -> Float[np.ndarray, "batch objects"] | None:
-    """Sliding friction with the floor where an effect changes it (NaN elsewhere), or None."""
-    found = [kind.floor_friction(motion, effect.target, effect.values) for kind, effect in _acting(batch)]
-    told = [one for one in found if one is not None]
-    if not told:
-        return None
-    result = told[0]
-    for one in told[1:]:
-        result = np.where(np.isnan(one), result, one)
-    return result
+    return any(kind.physical for kind, _ in acting_in(batch))
 
 
 def centre_of_mass(batch: SceneBatch) -> Float[np.ndarray, "batch objects 3"] | None:
     """Centres of mass in the bodies' frames [m], or None where all are at the centres."""
-    found = [kind.centre_of_mass(batch, effect.target, effect.values) for kind, effect in _acting(batch)]
+    found = [kind.centre_of_mass(batch, effect.target, effect.values) for kind, effect in acting_in(batch)]
     told = [one for one in found if one is not None]
     return sum(told[1:], told[0]) if told else None
 
@@ -133,7 +92,7 @@ def centre_of_mass(batch: SceneBatch) -> Float[np.ndarray, "batch objects 3"] | 
 def floor_rotation(batch: SceneBatch) -> Float[np.ndarray, "batch 3 3"] | None:
     """Floor to world, or None where the floor is level."""
     result = None
-    for kind, effect in _acting(batch):
+    for kind, effect in acting_in(batch):
         turn = kind.floor(effect.values)
         if turn is not None:
             result = turn if result is None else turn @ result
@@ -142,13 +101,13 @@ def floor_rotation(batch: SceneBatch) -> Float[np.ndarray, "batch 3 3"] | None:
 
 def untimed(batch: SceneBatch) -> SceneBatch:
     """The batch without what changes which frame is shown when."""
-    return dataclasses.replace(batch, effects=tuple(e for kind, e in _acting(batch) if not kind.retimes))
+    return dataclasses.replace(batch, effects=tuple(e for kind, e in acting_in(batch) if not kind.retimes))
 
 
 def shown_frames(batch: SceneBatch, frames: int) -> Int[np.ndarray, "batch frames"] | None:
     """Which simulated frame is shown in each frame of the clip, or None where they are the same."""
     index = None
-    for kind, effect in _acting(batch):
+    for kind, effect in acting_in(batch):
         told = kind.frame_times(frames, effect.values)
         if told is not None:
             index = told if index is None else index + told - np.arange(frames)
@@ -220,7 +179,7 @@ def quaternion_of(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, 
 
 def moves_camera(batch: SceneBatch) -> Bool[np.ndarray, ""]:
     """Whether an effect turns or moves the camera."""
-    return any(type(kind).camera is not EffectKind.camera for kind, _ in _acting(batch))  # type: ignore[return-value]
+    return any(type(kind).camera is not EffectKind.camera for kind, _ in acting_in(batch))  # type: ignore[return-value]
 
 
 def camera_path(
@@ -231,7 +190,7 @@ def camera_path(
     base = rotations.matrix(rotations.exponential(np.stack([batch.camera_pitch, level, level], -1)))[:, None]
     turn = np.broadcast_to(np.eye(3), (len(batch), frames, 3, 3))
     travel = np.zeros((len(batch), frames, 3))
-    for kind, effect in _acting(batch):
+    for kind, effect in acting_in(batch):
         told = kind.camera(frames, fps, effect.values)
         if told is not None:
             turn, travel = turn @ told[0], travel + told[1]
@@ -255,18 +214,18 @@ def apparent(
 
 def changes_outlines(batch: SceneBatch) -> bool:
     """Whether an effect changes outlines."""
-    return any(kind.drawn for kind, _ in _acting(batch))
+    return any(kind.drawn for kind, _ in acting_in(batch))
 
 
 def directions_of_outlines(batch: SceneBatch) -> int:
     """In how many directions what effects do to outlines must be told; 0: few do."""
-    return max((kind.directions(effect.values) for kind, effect in _acting(batch)), default=0)
+    return max((kind.directions(effect.values) for kind, effect in acting_in(batch)), default=0)
 
 
 def outline_change(batch: SceneBatch, view: OutlineView) -> Float[np.ndarray, "batch frames objects directions"]:
     """What the effects add to the support functions [px]; NaN where nothing is seen any more."""
     total = np.zeros(view.reach.shape)
-    for kind, effect in _acting(batch):
+    for kind, effect in acting_in(batch):
         told = kind.outline(view, effect.target, effect.values)
         if told is not None:
             total = total + told
@@ -277,14 +236,14 @@ def outlines_moved(
     batch: SceneBatch, view: OutlineView
 ) -> Float[np.ndarray, "batch frames objects directions 2"] | None:
     """How far effects move points of outlines [px], or None where none does."""
-    found = [kind.moved(view, effect.target, effect.values) for kind, effect in _acting(batch)]
+    found = [kind.moved(view, effect.target, effect.values) for kind, effect in acting_in(batch)]
     told = [one for one in found if one is not None]
     return sum(told[1:], told[0]) if told else None
 
 
 def overdrawn(batch: SceneBatch) -> Float[np.ndarray, "batch"] | None:
     """How far masks show what lies beside the objects [px], or None where no effect says so."""
-    found = [kind.overdrawn(effect.values) for kind, effect in _acting(batch)]
+    found = [kind.overdrawn(effect.values) for kind, effect in acting_in(batch)]
     told = [one for one in found if one is not None]
     return sum(told[1:], told[0]) if told else None
 
@@ -293,7 +252,7 @@ def hidden_polygons(
     batch: SceneBatch, outline: Float[np.ndarray, "batch frames objects corners 2"]
 ) -> Float[np.ndarray, "batch frames objects others 2"] | None:
     """The parts of convex polygons that an effect hides [px], or None where none does."""
-    for kind, effect in _acting(batch):
+    for kind, effect in acting_in(batch):
         told = kind.hidden(outline, effect.values)
         if told is not None:
             return told
@@ -302,7 +261,7 @@ def hidden_polygons(
 
 def warps(batch: SceneBatch) -> bool:
     """Whether an effect moves points of the picture."""
-    return any(type(kind).warp is not EffectKind.warp for kind, _ in _acting(batch))
+    return any(type(kind).warp is not EffectKind.warp for kind, _ in acting_in(batch))
 
 
 def warped(
@@ -312,7 +271,7 @@ def warped(
     image: tuple[int, int],
 ) -> Float[np.ndarray, "batch *shape 2"]:
     """Where points of the undistorted picture are seen [px]."""
-    for kind, effect in _acting(batch):
+    for kind, effect in acting_in(batch):
         moved = kind.warp(points, focal, image, effect.values)
         if moved is not None:
             points = points + moved

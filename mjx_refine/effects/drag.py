@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mjx_refine import rotations
 from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Loads, Motion, of_target
 
 
@@ -22,7 +23,7 @@ class Drag(EffectKind):
 
     def loads(self, motion: Motion, target: int, values: np.ndarray) -> Loads | None:
         v = motion.velocity[:, target]
-        speed = np.linalg.norm(v, axis=-1)
+        speed = rotations.length(v)
         # One explicit step may at most stop the body.
         resistance = np.minimum(values[:, 0] + values[:, 1] * speed, 100.0 * motion.batch.mass[:, target])
         force = of_target(motion.batch, target, -resistance[:, None] * v)

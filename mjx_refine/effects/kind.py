@@ -116,7 +116,8 @@ class Motion:
       velocity: of the centres [m/s].
       turning: angular velocity in the bodies' own axes [rad/s].
       batch: sizes, masses, friction.
-      known: what effects have worked out at this instant and will ask again.
+      lasting: what effects have worked out and will ask for again at any instant of the rollout.
+      known: the same at this instant.
     """
 
     time: float
@@ -126,6 +127,7 @@ class Motion:
     velocity: Float[np.ndarray, "batch objects 3"]
     turning: Float[np.ndarray, "batch objects 3"]
     batch: SceneBatch
+    lasting: dict[Hashable, Any] = dataclasses.field(default_factory=dict, repr=False, compare=False)
     known: dict[Hashable, Any] = dataclasses.field(default_factory=dict, repr=False, compare=False)
 
     @property
@@ -141,6 +143,10 @@ class Motion:
         if "spin" not in self.known:
             self.known["spin"] = rotations.turned(self.axes, self.turning)
         return self.known["spin"]
+
+    def spin_of(self, target: int) -> Float[np.ndarray, "batch 3"]:
+        """Angular velocity of one body [rad/s]."""
+        return rotations.turned(rotations.matrix(self.quaternion[:, target]), self.turning[:, target])
 
 
 Loads = tuple[Float[np.ndarray, "batch objects 3"], Float[np.ndarray, "batch objects 3"]]

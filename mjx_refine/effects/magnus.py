@@ -20,7 +20,7 @@ class Magnus(EffectKind):
     parameters = (EffectParameter("coefficient", "kg", 0.05, -1e3, 1e3),)
 
     def loads(self, motion: Motion, target: int, values: np.ndarray) -> Loads | None:
-        lift = values[:, :1] * rotations.cross(motion.spin[:, target], motion.velocity[:, target])
+        lift = values[:, :1] * rotations.cross(motion.spin_of(target), motion.velocity[:, target])
         most = 100.0 * motion.batch.mass[:, target, None]
         force = of_target(motion.batch, target, np.clip(lift, -most, most))
         return force, np.zeros_like(force)

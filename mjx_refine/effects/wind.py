@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
+from mjx_refine import rotations
+from mjx_refine.batch import SceneBatch
 from mjx_refine.effects.kind import EffectKind, EffectParameter, FitView, Loads, Motion, Start
 
 DRAG = {"sphere": 0.47, "cylinder": 0.8, "box": 1.05}
@@ -33,20 +36,31 @@ class Wind(EffectKind):
     )
 
     def loads(self, motion: Motion, target: int, values: np.ndarray) -> Loads | None:
-        force = np.zeros_like(motion.position)
-        shadow = felt_shadow(motion.batch)[..., None]
-        pressure = values[:, None, :2]
+        key = (self.name, id(values))
+        if key not in motion.lasting:
+            motion.lasting[key] = self._of_all_steps(motion.batch, values)
+        direction, steady, slowness, most = motion.lasting[key]
+        if slowness is None:
+            return steady * direction, np.zeros_like(direction)
+        against = direction - slowness * motion.velocity
+        resistance = steady * rotations.length(against)[..., None]
+        return np.minimum(resistance, most) * against, np.zeros_like(against)
+
+    def _of_all_steps(
+        self, batch: SceneBatch, values: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, Any]:
+        """Directions of the wind on each body, what it presses with at rest, ``slowness`` and what may be pressed with at most;
+        without slowness what is pressed along each axis, and None."""
+        shadow = felt_shadow(batch)[..., None]
+        pressure, along = values[:, None, :2], np.zeros((*batch.mass.shape, 3))
         if not values[:, 2].any():
-            force[..., :2] = pressure * shadow
-            return force, np.zeros_like(force)
+            along[..., :2] = pressure
+            return along, shadow, None, None
         strength = np.linalg.norm(pressure, axis=-1, keepdims=True)
-        force[..., :2] = pressure / np.maximum(strength, 1e-300)
+        along[..., :2] = pressure / np.maximum(strength, 1e-300)
         slowness = values[:, 2, None, None]
-        against = force - slowness * motion.velocity
-        resistance = strength * shadow * np.linalg.norm(against, axis=-1, keepdims=True)
         # One explicit step may at most stop the body.
-        most = 100.0 * motion.batch.mass[..., None] / np.maximum(slowness, 1e-9)
-        return np.minimum(resistance, most) * against, np.zeros_like(force)
+        return along, strength * shadow, slowness, 100.0 * batch.mass[..., None] / np.maximum(slowness, 1e-9)
 
     def idle(self, motion: Motion, target: int, values: np.ndarray) -> float:
         return 0.0 if values[:, 2].any() else np.inf

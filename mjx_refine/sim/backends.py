@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.children import cores
-from mjx_refine.effects import acting
+from mjx_refine.effects.loading import has_loads
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Shape
 from mjx_refine.sim.carried import refuse_loads
@@ -100,7 +100,7 @@ def backend_for(name: str, batch: SceneBatch) -> str:
       InputError: no such backend, or one that cannot run here or cannot carry an effect.
     """
     resolved = resolve_backend(name)
-    if resolved == "mujoco" or not acting.has_loads(batch):
+    if resolved == "mujoco" or not has_loads(batch):
         return resolved
     if name == "auto":
         return "mujoco"

@@ -12,6 +12,7 @@ from mujoco import rollout
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting
+from mjx_refine.effects.loading import has_loads
 from mjx_refine.scene import Shape
 from mjx_refine.sim import cores
 from mjx_refine.sim.buckets import diverged_to_nan
@@ -120,7 +121,7 @@ class MujocoSimulator:
         size = mujoco.mj_stateSize(models[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
         state = np.zeros((len(batch), size))
         state[:, 1 : 1 + qpos.shape[1] + qvel.shape[1]] = np.concatenate([qpos, qvel], 1)
-        if batch.effects and acting.has_loads(batch):
+        if batch.effects and has_loads(batch):
             later = stepped_rollout(self._workers_for, models, data, state, batch, frames, world, restarts)
             return np.concatenate([first, later], 1)
         parts, frame = [first], 0

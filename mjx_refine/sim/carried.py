@@ -11,6 +11,7 @@ from jaxtyping import Float
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
 from mjx_refine.effects import acting
+from mjx_refine.effects.loading import with_loads
 from mjx_refine.errors import InputError
 
 Inner = Callable[[SceneBatch, int, np.ndarray | None], np.ndarray]
@@ -46,6 +47,6 @@ def refuse_loads(batch: SceneBatch, backend: str) -> None:
     """
     if batch.restarts:
         raise ValueError(f"backend {backend} restarts no objects; expected C MuJoCo")
-    lacking = acting.with_loads(batch)
+    lacking = with_loads(batch)
     if lacking:
         raise InputError(f"effect {lacking[0]}: backend {backend} cannot carry it; use --backend mujoco")

@@ -10,7 +10,8 @@ import pytest
 from effect_scenes import BALL, CAMERA, FPS, GRAVITY, STEP, effect, rolled_out
 
 from mjx_refine import rotations
-from mjx_refine.effects import acting, batch_with_effects
+from mjx_refine.effects import batch_with_effects
+from mjx_refine.effects.loading import Loading
 from mjx_refine.scene import Body, Scene
 from mjx_refine.sim.c import MujocoSimulator
 
@@ -234,7 +235,7 @@ IDLING = (
 
 
 def single_steps(monkeypatch) -> None:
-    monkeypatch.setattr(acting, "idle", lambda batch, motion: 0.0)
+    monkeypatch.setattr(Loading, "idle", lambda loading, motion: 0.0)
 
 
 @pytest.mark.parametrize("entry", IDLING, ids=lambda e: e.effect)
@@ -286,14 +287,14 @@ def tumble_at_a_wall(seed: int) -> Scene:
 
 def test_a_wall_is_looked_at_seldom_and_never_too_late(monkeypatch):
     """Steps together differ from single ones by the solver's first guess alone, which bounces let grow."""
-    scenes, looks, idle = [tumble_at_a_wall(seed) for seed in range(30)], [0, 0], acting.idle
+    scenes, looks, idle = [tumble_at_a_wall(seed) for seed in range(30)], [0, 0], Loading.idle
 
     def run(each: int) -> np.ndarray:
-        def counted(batch, motion):
+        def counted(loading, motion):
             looks[each] += 1
-            return 0.0 if each else idle(batch, motion)
+            return 0.0 if each else idle(loading, motion)
 
-        monkeypatch.setattr(acting, "idle", counted)
+        monkeypatch.setattr(Loading, "idle", counted)
         return np.array(
             [MujocoSimulator(s.shapes, FPS, 1).rollout(batch_with_effects([s]), 16)[0, ..., :3] for s in scenes]
         )

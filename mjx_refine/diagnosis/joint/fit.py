@@ -15,7 +15,7 @@ from mjx_refine.diagnosis.joint.arrow import Arrow
 from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis, with_frozen_setup
 from mjx_refine.diagnosis.pace import DAMPINGS, STEPS, Pace, behind
 from mjx_refine.diagnosis.store import Arrays, fingerprint, packed, remembered, unpacked
-from mjx_refine.effects import acting
+from mjx_refine.effects.loading import has_loads
 
 Keeps = Sequence[Bool[np.ndarray, "frames"]] | None
 
@@ -131,7 +131,7 @@ class Clips:
         batches = [part.batch(z) for part, z in zip(hypothesis.parts, points, strict=True)]
         lengths = {tuple(e.values.shape[1] for e in batch.effects) for batch in batches}
         simulators = {id(clip.simulator) for clip in self.clips}
-        if not (acting.has_loads(batches[0]) and len(lengths) == 1 and len(simulators) == 1):
+        if not (has_loads(batches[0]) and len(lengths) == 1 and len(simulators) == 1):
             return [clip.simulator.rollout(b, clip.frames) for clip, b in self._counted(batches)]
         whole = concatenate([batch for _, batch in self._counted(batches)])
         rows = [
