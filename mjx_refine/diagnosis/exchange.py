@@ -58,7 +58,7 @@ def begun_again(clip: ClipFit, fit: Fit, sources: list[Fit], count: int) -> Fit:
                 best, least = (hypothesis, points[int(np.argmin(costs))]), float(costs.min())
     if best is None:
         return fit
-    again = knocked(clip, clip.fit(*best, ITERATIONS))
+    again = knocked(clip, clip.fit(*best, ITERATIONS, thorough=False))
     return again if again.evidence > fit.evidence else fit
 
 
@@ -83,4 +83,4 @@ def alone(clip: ClipFit, fit: Fit, k: int) -> Fit:
     ends = count + np.cumsum([int(t.free.sum()) for t in hypothesis.terms])
     own = fit.z[ends[k] - int(hypothesis.terms[k].free.sum()) : ends[k]]
     single = dataclasses.replace(hypothesis, terms=(hypothesis.terms[k],))
-    return knocked(clip, clip.fit(single, np.concatenate([fit.z[:count], own]), ALONE))
+    return knocked(clip, clip.fit(single, np.concatenate([fit.z[:count], own]), ALONE, thorough=False))

@@ -18,7 +18,7 @@ from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.nodes import missed_by, missing, with_struck
 from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, jagged, settled
-from mjx_refine.diagnosis.pace import STEPS, Standing, descended
+from mjx_refine.diagnosis.pace import STEPS, Effort, Standing, descended
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.roam import ROAMED, Strategy, hopped, looked_around
 from mjx_refine.diagnosis.settled import Loose, Settled
@@ -335,26 +335,26 @@ class ClipFit:
         scale: float = SCALE,
         rival: float = np.inf,
         attempts: int | None = None,
+        thorough: bool = True,
     ) -> Fit:
-        """Levenberg-Marquardt from ``z``; given up far behind ``rival``, another's cost; interrupted after ``attempts``."""
-        return self._descended(hypothesis, np.clip(z, *hypothesis.bounds), iterations, keep, scale, rival, attempts)
+        """Levenberg-Marquardt from ``z`` with an ``Effort``."""
+        effort = Effort(iterations, rival, attempts, thorough)
+        return self._descended(hypothesis, np.clip(z, *hypothesis.bounds), keep, scale, effort)
 
     @remembered
-    def gone_on(self, fit: Fit, iterations: int, rival: float = np.inf) -> Fit:
+    def gone_on(self, fit: Fit, iterations: int, rival: float = np.inf, thorough: bool = True) -> Fit:
         """Levenberg-Marquardt from where it was interrupted, of a fit to all frames."""
         start = Standing(fit.z, fit.residual, fit.cost, fit.jacobian)
-        return self._descended(fit.hypothesis, start, iterations, None, SCALE, rival, None)
+        return self._descended(fit.hypothesis, start, None, SCALE, Effort(iterations, rival, None, thorough))
 
-    def _descended(self, hypothesis: Hypothesis, start, iterations: int, keep, scale: float, rival, attempts) -> Fit:
+    def _descended(self, hypothesis: Hypothesis, start, keep, scale: float, effort: Effort) -> Fit:
         ended = descended(
             start,
             lambda points: self.residuals(hypothesis, points, keep, scale),
             lambda z, _, size: self.jacobian(hypothesis, z, keep, scale, size),
             functools.partial(prior, hypothesis),
             hypothesis.bounds,
-            iterations,
-            rival,
-            attempts,
+            effort,
         )
         return self._finished(hypothesis, ended.z, ended.base, ended.slopes, keep, ended.ended)
 

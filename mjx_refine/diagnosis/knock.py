@@ -54,7 +54,7 @@ def knocked(clip: ClipFit, fit: Fit, rival: float = np.inf) -> Fit:
 
 def to_the_end(clip: ClipFit, fit: Fit, iterations: int, rival: float) -> Fit:
     """A fit that was interrupted, at its end, its impacts with unseen things as they may err."""
-    return knocked(clip, fit if fit.ended else clip.gone_on(fit, iterations, rival), rival)
+    return knocked(clip, fit if fit.ended else clip.gone_on(fit, iterations, rival, thorough=False), rival)
 
 
 def strike_notes(hypothesis: Hypothesis, names: Sequence[str]) -> list[str]:

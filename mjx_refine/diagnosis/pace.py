@@ -52,17 +52,36 @@ def updated(
     return jacobian + np.outer(change - jacobian @ step, step) / max(float(step @ step), 1e-12)
 
 
+class Effort(NamedTuple):
+    """How long least squares go on.
+
+    Attributes:
+      iterations: steps that were worth one, or were taken with derivatives made for them.
+      rival: cost of another hypothesis; what stays far behind it is given up.
+      attempts: steps after which they are interrupted, whatever they were worth; never by default.
+      thorough: whether larger differences are tried in the end. Where another fit goes on from there, that one tries them.
+    """
+
+    iterations: int
+    rival: float = np.inf
+    attempts: int | None = None
+    thorough: bool = True
+
+
 class Pace:
     """Of one fit.
 
+    Args:
+      sizes: of finite differences, one after the other.
+
     Attributes:
-      size: of finite differences, one of ``STEPS``.
+      size: of the finite differences of now.
       damping: multiplies ``DAMPINGS``.
       failed: steps in a row that gained next to nothing.
     """
 
-    def __init__(self):
-        self.size, self.damping, self.failed = STEPS[0], 1.0, 0
+    def __init__(self, sizes: tuple[float, ...] = STEPS):
+        self.sizes, self.size, self.damping, self.failed = sizes, sizes[0], 1.0, 0
 
     def done(self, gain: float, best: int, cost: float) -> bool:
         """Takes a step's gain, which of ``DAMPINGS`` it had and the cost afterwards; True where no other helps either."""
@@ -72,12 +91,12 @@ class Pace:
             self.failed = 0
             return False
         self.failed += 1
-        if self.failed > len(STEPS):
+        if self.failed > len(self.sizes):
             return True
         # First shorter steps, then other derivatives.
         shorter = self.failed == 1 and gain <= 0
         self.damping = min(300.0 * self.damping, 1e3) if shorter else 1.0
-        self.size = self.size if shorter else STEPS[(STEPS.index(self.size) + 1) % len(STEPS)]
+        self.size = self.size if shorter else self.sizes[(self.sizes.index(self.size) + 1) % len(self.sizes)]
         return False
 
 
@@ -110,9 +129,7 @@ def descended(
     jacobian: Callable[[np.ndarray, np.ndarray, float], np.ndarray],
     prior: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
     bounds: tuple[np.ndarray, np.ndarray],
-    iterations: int,
-    rival: float = np.inf,
-    attempts: int | None = None,
+    effort: Effort,
 ) -> Standing:
     """Where least squares lead.
 
@@ -122,11 +139,9 @@ def descended(
       jacobian: at a point with its residuals, by differences of some size (``STEPS``).
       prior: of a point: residuals of the prior, and their slopes.
       bounds: of the coordinates.
-      iterations: steps that were worth one, or were taken with derivatives made for them.
-      rival: cost of another hypothesis; what stays far behind it is given up.
-      attempts: steps after which they are interrupted, whatever they were worth; never by default.
+      effort: how long they go on.
     """
-    pace, usual = Pace(), 0.0
+    pace, usual, iterations = Pace(STEPS if effort.thorough else STEPS[:1]), 0.0, effort.iterations
     if isinstance(start, Standing):
         (z, base, cost, slopes, _), fresh = start, False
     else:
@@ -151,7 +166,7 @@ def descended(
             iterations -= 1
             if pace.done(gain, best, cost):
                 break
-        if behind(attempt, cost, rival) or attempt == attempts:
+        if behind(attempt, cost, effort.rival) or attempt == effort.attempts:
             return Standing(z, base, cost, updated(slopes, step, change) if gain > 0 else slopes, False)
         if worth and pace.failed == 0:
             slopes, fresh, usual = updated(slopes, step, change), False, gain

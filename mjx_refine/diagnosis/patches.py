@@ -58,5 +58,5 @@ def _crossings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis,
 
 
 def _fitted(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray, iterations: int) -> Fit:
-    fit = clip.fit(hypothesis, z, iterations)
+    fit = clip.fit(hypothesis, z, iterations, thorough=False)
     return knocked(clip, fit) if iterations > LOOK else fit

@@ -221,4 +221,4 @@ def _along_its_own(clip: ClipFit, fit: Fit) -> Fit:
 
 def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:
     fit = _along_its_own(clip, fit)
-    return knocked(clip, clip.fit(fit.hypothesis, fit.z, iterations))
+    return knocked(clip, clip.fit(fit.hypothesis, fit.z, iterations, thorough=False))

@@ -71,4 +71,4 @@ def found_before(clip: ClipFit, base: Fit, before: tuple[Candidate, ...]) -> Fit
 def _fitted(clip: ClipFit, there: Fit, iterations: int) -> Fit:
     """Least squares from where a fit stands, with what contacts along its path may err by."""
     hypothesis = dataclasses.replace(there.hypothesis, slack=clip.slack_along(there))
-    return knocked(clip, clip.fit(hypothesis, there.z, iterations))
+    return knocked(clip, clip.fit(hypothesis, there.z, iterations, thorough=False))

@@ -191,12 +191,11 @@ def _near(fits: list[Fit], nothing: float, bound: float) -> list[int]:
 def _begun(clip: ClipFit, here: Fit, lead: Lead, scale: float, rival: float) -> Fit:
     """A lead's fit after its first steps."""
     hypothesis, z = begun(clip, here, lead, scale)
-    fit = clip.fit(hypothesis, z, 9, rival=rival, attempts=LOOK)
+    fit = clip.fit(hypothesis, z, 9, rival=rival, attempts=LOOK, thorough=False)
     if fit.cost > here.cost and scale == SCALE and not lead.whole:
         # Where the linear look misleads, the effect grows from nothing.
-        fit = clip.fit(
-            hypothesis, np.concatenate([here.z, 0 * lead.z(hypothesis.terms[-1])]), 9, rival=rival, attempts=LOOK
-        )
+        z = np.concatenate([here.z, 0 * lead.z(hypothesis.terms[-1])])
+        fit = clip.fit(hypothesis, z, 9, rival=rival, attempts=LOOK, thorough=False)
     return fit
 
 

@@ -20,5 +20,6 @@ def staged(clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimensio
     """The fit of ``hypothesis`` that begins at ``z`` with the first frames alone."""
     frames = np.arange(clip.frames)
     for stage in range(1, STAGES + 1):
-        z = clip.fit(hypothesis, z, ITERATIONS, frames < 1 + np.ceil((clip.frames - 1) * stage / (STAGES + 1))).z
-    return clip.fit(hypothesis, z, LAST)
+        keep = frames < 1 + np.ceil((clip.frames - 1) * stage / (STAGES + 1))
+        z = clip.fit(hypothesis, z, ITERATIONS, keep, thorough=False).z
+    return clip.fit(hypothesis, z, LAST, thorough=False)

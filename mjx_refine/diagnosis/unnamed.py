@@ -58,5 +58,5 @@ def _best_lead(clip: ClipFit, here: Fit, view: FitView, scale: float) -> Lead:
 
 def _fitted(clip: ClipFit, here: Fit, lead: Lead, scale: float, rival: float, others: list[Fit]) -> Fit:
     hypothesis, z = begun(clip, here, lead, scale)
-    fit = knocked(clip, clip.fit(hypothesis, z, ITERATIONS, rival=rival), rival)
+    fit = knocked(clip, clip.fit(hypothesis, z, ITERATIONS, rival=rival, thorough=False), rival)
     return begun_again(clip, fit, others, here.hypothesis.dimension) if fit.cost < NEAR * rival else fit

@@ -80,8 +80,9 @@ def _facings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis, n
 
 def _wall(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray, rival: float) -> Fit:
     """The better of two: one whose impact errs from the first step on, and one whose impact does once its place is found."""
-    late = knocked(clip, clip.fit(hypothesis, z, ITERATIONS, rival=PATIENCE * rival), rival)
+    late = knocked(clip, clip.fit(hypothesis, z, ITERATIONS, rival=PATIENCE * rival, thorough=False), rival)
     *others, wall = hypothesis.terms
     wall = dataclasses.replace(wall, excused=excuses(clip, hypothesis, z, len(others)))
-    early = clip.fit(dataclasses.replace(hypothesis, terms=(*others, wall)), z, ITERATIONS, rival=PATIENCE * rival)
+    erring = dataclasses.replace(hypothesis, terms=(*others, wall))
+    early = clip.fit(erring, z, ITERATIONS, rival=PATIENCE * rival, thorough=False)
     return max(late, knocked(clip, early, rival), key=lambda fit: fit.evidence)

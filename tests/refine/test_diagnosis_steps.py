@@ -16,7 +16,7 @@ from mjx_refine.diagnosis.hypothesis import term
 from mjx_refine.diagnosis.measure import Parts, moment_roughness
 from mjx_refine.diagnosis.noise import Counts, settled
 from mjx_refine.diagnosis.numbers import tied
-from mjx_refine.diagnosis.pace import ATTEMPTS, STEPS, damped, descended, updated
+from mjx_refine.diagnosis.pace import ATTEMPTS, STEPS, Effort, damped, descended, updated
 from mjx_refine.diagnosis.roam import Strategy
 
 RNG = np.random.default_rng(0)
@@ -49,6 +49,7 @@ class Curved:
 
     def __init__(self):
         self.rows = self.slopes = 0
+        self.sizes = []
 
     def residuals(self, points):
         self.rows += len(points)
@@ -58,11 +59,12 @@ class Curved:
 
     def jacobian(self, z, base, size):
         self.slopes += 1
+        self.sizes.append(size)
         assert np.array_equal(base, self.residuals(z[None])[0][0])
         assert size in STEPS
         return np.array([[-20 * z[0], 10.0], [-1.0, 0.0], [0.0, 0.0]])
 
-    def descended(self, iterations, rival=np.inf, attempts=None, start=None):
+    def descended(self, iterations, rival=np.inf, attempts=None, start=None, thorough=True):
         wide = np.full(2, 1e3)
         nothing = np.zeros(2)
         return descended(
@@ -71,9 +73,7 @@ class Curved:
             self.jacobian,
             lambda z: (nothing, nothing),
             (-wide, wide),
-            iterations,
-            rival,
-            attempts,
+            Effort(iterations, rival, attempts, thorough),
         )
 
 
@@ -113,6 +113,17 @@ def test_what_was_interrupted_goes_on_from_its_derivatives():
     whole = curved.descended(100, start=part)
     assert whole.ended
     assert whole.cost < 4.5 + 0.05
+
+
+def test_larger_differences_are_tried_by_the_last_of_several_fits_alone():
+    thorough, passing = Curved(), Curved()
+    thorough.descended(100)
+    ended = passing.descended(100, thorough=False)
+    assert set(thorough.sizes) == set(STEPS)
+    assert set(passing.sizes) == {STEPS[0]}
+    assert ended.ended
+    assert ended.cost < 4.5 + 0.05
+    assert len(passing.sizes) < len(thorough.sizes)
 
 
 def _ended(seed: int, jag: float) -> float:
@@ -198,7 +209,7 @@ class _Stuck:
     def slack_along(self, fit):
         return None
 
-    def fit(self, hypothesis, z, iterations):
+    def fit(self, hypothesis, z, iterations, thorough=True):
         cost = float(self.residuals(hypothesis, z[None])[1][0])
         return Fit(hypothesis, z, cost, cost, np.eye(len(z)), z, -cost)
 
