@@ -148,14 +148,14 @@ def _of_their_families(found: list[tuple[Lead, Fit]]) -> list[tuple[Lead, Fit]]:
 
 def _ground(clip: ClipFit, plain: Hypothesis, by_stages: bool) -> Fit:
     start = np.zeros(plain.dimension)
-    return staged(clip, plain, start) if by_stages else clip.fit(plain, start, GROUND, thorough=False)
+    return staged(clip, plain, start) if by_stages else clip.fit(plain, start, GROUND)
 
 
 def _first(clip: ClipFit, ground: Fit, lead: Lead, by_stages: bool = False) -> Fit:
     """An effect's fit from where it was seen or, where that is cheaper, by stages from the given scene."""
     one = lead.term(clip.frames)
     hypothesis, z = ground.hypothesis.added(one), lead.z(one)
-    fit = clip.fit(hypothesis, beginning(clip, hypothesis, ground, lead, z), FIRST, rival=ground.cost, thorough=False)
+    fit = clip.fit(hypothesis, beginning(clip, hypothesis, ground, lead, z), FIRST, rival=ground.cost)
     if not by_stages:
         return fit
     other = staged(clip, hypothesis, np.concatenate([np.zeros(len(ground.z)), z]))
@@ -163,7 +163,7 @@ def _first(clip: ClipFit, ground: Fit, lead: Lead, by_stages: bool = False) -> F
 
 
 def _further(clip: ClipFit, fit: Fit) -> Fit:
-    return clip.fit(fit.hypothesis, fit.z, FURTHER, thorough=False)
+    return clip.fit(fit.hypothesis, fit.z, FURTHER)
 
 
 def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
@@ -171,4 +171,4 @@ def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
 
 
 def _last(clip: ClipFit, fit: Fit, rival: float) -> Fit:
-    return knocked(clip, clip.fit(cooled(clip, fit), fit.z, LAST, rival=rival, thorough=False), rival)
+    return knocked(clip, clip.fit(cooled(clip, fit), fit.z, LAST, rival=rival), rival)
