@@ -198,3 +198,44 @@ def test_an_obstacle_that_is_leant_on_takes_no_place_of_one_that_is_hit(monkeypa
     fitted: dict = {} if old is None else {key: (old, 1.0)}
     singles._keep(cast(Any, None), fitted, key, new, 2.0)
     assert fitted[key] == ((old, 1.0) if stays else (new, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("gains", "early", "looked_for"),
+    [
+        ((0.9,), None, False),
+        ((), None, False),
+        ((0.1, 1.1), None, True),
+        ((0.1,), 210.0, True),
+        ((0.1,), 190.0, False),
+    ],
+)
+def test_two_effects_are_looked_for_where_a_second_promises_something_beside_the_best(
+    monkeypatch, gains, early, looked_for
+):
+    best, other = candidate(200.0, ("shape", 0)), candidate(90.0, ("drag", 0))
+    begun: list[str] = []
+
+    def beside(clip, firsts, names, shown):
+        # Beside what does not lead everything promises much.
+        return [
+            (one, SimpleNamespace(gain=(g if one is best else 1e6) * pairs.HOPE * MISFIT, name="push", target=0))
+            for one in firsts
+            for g in gains
+        ]
+
+    def each(clip, piece, rows, told=None, lines=()):
+        begun.append(piece.__name__)
+        raise StopIteration
+
+    clip: Any = SimpleNamespace(misfit=lambda fit: MISFIT, crew=SimpleNamespace(each=each))
+    monkeypatch.setattr(pairs, "_beside", beside)
+    twos = () if early is None else (candidate(early, ("shape", 0), ("drag", 0)),)
+    try:
+        found = pairs.pairs_of(clip, cast(Any, None), (best, other), twos, [], cast(Any, None), 0, lambda line: None)
+    except StopIteration:
+        found = None
+    assert (found is None) == looked_for
+    assert bool(begun) == looked_for
+    # What was found with more noise stands either way.
+    assert found is None or found == twos
