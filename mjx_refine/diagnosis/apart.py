@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
+from mjx_refine.batch import SceneBatch
 from mjx_refine.diagnosis.hypothesis import WHOLE, Hypothesis
 from mjx_refine.diagnosis.nodes import missed_by
 from mjx_refine.sim.model import model_fields
@@ -19,8 +20,8 @@ from mjx_refine.sim.model import model_fields
 Flight = tuple[Float[np.ndarray, "rows frames objects 7"], Float[np.ndarray, "rows nodes 13"]]
 """Poses, and the states in which paths arrive at nodes."""
 
-Fly = Callable[[np.ndarray], Flight]
-"""Points, one a row, to what is simulated there."""
+Fly = Callable[[SceneBatch], Flight]
+"""Candidates to what is simulated of them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,14 +29,14 @@ class Beside:
     """Points beside one at which derivatives are asked for.
 
     Attributes:
-      points: the point itself, and then those beside it.
-      poses: of the rollouts there.
+      batch: the candidate at the point itself, and then those beside it.
+      poses: of their rollouts.
       missed: by how much their paths miss the next ones' begin, where there are nodes.
       row: beside which of them each coordinate is moved.
       felt: which objects' residuals each coordinate changes there, and in the last column whether the background's.
     """
 
-    points: Float[np.ndarray, "rows dimension"]
+    batch: SceneBatch
     poses: Float[np.ndarray, "rows frames objects 7"]
     missed: Float[np.ndarray, "rows missed"]
     row: Int[np.ndarray, "dimension"]
@@ -58,26 +59,26 @@ def beside(
       hypothesis: whose coordinates they are.
       z: the point.
       step: of each coordinate.
-      fly: simulates points, one a row.
+      fly: simulates candidates.
     """
-    still = fly(z[None])
-    met = _meetings(hypothesis, z[None], still[0]) | hypothesis.couples
+    here = hypothesis.batch(z[None])
+    still = fly(here)
+    met = _meetings(here, still[0]) | hypothesis.couples
     rows, shared = _shared(hypothesis, companies(met))
-    points, flown = _flown(hypothesis, z, shared * step, still, fly)
-    company = companies(met | _meetings(hypothesis, points, flown[0]))
+    batch, flown = _flown(hypothesis, z, shared * step, still, fly)
+    company = companies(met | _meetings(batch, flown[0]))
     if len(shared) < len(z) and (company != companies(met)).any():
         rows, shared = _shared(hypothesis, np.zeros_like(company))
-        points, flown = _flown(hypothesis, z, shared * step, still, fly)
+        batch, flown = _flown(hypothesis, z, shared * step, still, fly)
         company = np.zeros_like(company)
     if len(shared) < len(rows):
-        points = np.clip(z + rows * step, *hypothesis.bounds)
+        batch = _stepped(hypothesis, z, rows * step)
         flown = _told_apart(hypothesis, company, rows, shared, still, flown)
     row = rows.argmax(0)
     alone = rows.sum(1)[row] == 1
     felt = alone[:, None] | (company[hypothesis.owners][:, None] == np.append(company, -1))
-    points, poses, arrived = (np.concatenate(two) for two in zip((z[None], *still), (points, *flown), strict=True))
-    missed = missed_by(hypothesis.nodes, arrived, hypothesis.batch(points).restarts)
-    return Beside(points, poses, missed, 1 + row, felt)
+    poses, arrived = (np.concatenate(two) for two in zip(still, flown, strict=True))
+    return Beside(batch, poses, missed_by(hypothesis.nodes, arrived, batch.restarts), 1 + row, felt)
 
 
 def _shared(hypothesis: Hypothesis, company: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -93,12 +94,20 @@ def _shared(hypothesis: Hypothesis, company: np.ndarray) -> tuple[np.ndarray, np
     return rows, moved_together(owners, company, moves, stretches)
 
 
-def _flown(hypothesis: Hypothesis, z: np.ndarray, steps: np.ndarray, still: Flight, fly: Fly):
-    points, (poses, arrived) = np.clip(z + steps, *hypothesis.bounds), (np.repeat(s, len(steps), 0) for s in still)
+def _stepped(hypothesis: Hypothesis, z: np.ndarray, steps: np.ndarray) -> SceneBatch:
+    """The candidate at ``z``, and those a step away."""
+    return hypothesis.batch(np.clip(z + np.concatenate([0 * steps[:1], steps]), *hypothesis.bounds))
+
+
+def _flown(
+    hypothesis: Hypothesis, z: np.ndarray, steps: np.ndarray, still: Flight, fly: Fly
+) -> tuple[SceneBatch, Flight]:
+    """``_stepped``, and what is simulated a step away; where a step changes only what is seen, it is as at ``z``."""
+    batch, (poses, arrived) = _stepped(hypothesis, z, steps), (np.repeat(s, len(steps), 0) for s in still)
     moves = (steps[:, hypothesis.moves] != 0).any(1)
     if moves.any():
-        poses[moves], arrived[moves] = fly(points[moves])
-    return points, (poses, arrived)
+        poses[moves], arrived[moves] = fly(batch[1:][moves])
+    return batch, (poses, arrived)
 
 
 def _told_apart(
@@ -117,8 +126,8 @@ def _told_apart(
     return poses, arrived
 
 
-def _meetings(hypothesis: Hypothesis, points: np.ndarray, poses: np.ndarray) -> Bool[np.ndarray, "objects objects"]:
-    return meetings(poses, model_fields(hypothesis.batch(points)).geom_rbound)
+def _meetings(batch: SceneBatch, poses: np.ndarray) -> Bool[np.ndarray, "objects objects"]:
+    return meetings(poses, model_fields(batch).geom_rbound[-len(poses) :])
 
 
 def meetings(

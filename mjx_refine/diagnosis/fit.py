@@ -316,8 +316,8 @@ class ClipFit:
     def jacobian(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE, size=STEPS[0]):
         """d residuals / d z (R, D) by differences towards the inside of the bounds."""
         step = np.where(z + size > hypothesis.bounds[1], -size, size)
-        told = beside(hypothesis, z, step, lambda points: self.flown(hypothesis.batch(points), keep))
-        prediction = self.predictor(told.poses, hypothesis.batch(told.points))
+        told = beside(hypothesis, z, step, lambda batch: self.flown(batch, keep))
+        prediction = self.predictor(told.poses, told.batch)
         white = self.rigid(self.distances(prediction), keep, scale)
         change = np.where(told.felt[:, self.measured.objects], white[told.row] - white[0], 0.0)
         slack = self._slack(keep, hypothesis)

@@ -70,13 +70,13 @@ def test_rollouts_are_shared_only_where_objects_do_not_meet(distance, fewer):
     hypothesis = Hypothesis(Space.around(one)).added(term("magnus", 0, 12))
     simulator, asked = MujocoSimulator(one.shapes, 30.0, 1), []
 
-    def shot(points):
-        asked.append(len(points))
-        return simulator.rollout(hypothesis.batch(points), 12), np.zeros((len(points), 0, 13))
+    def fly(batch):
+        asked.append(len(batch))
+        return simulator.rollout(batch, 12), np.zeros((len(batch), 0, 13))
 
     z, step = np.zeros(hypothesis.dimension), np.full(hypothesis.dimension, 0.01)
-    told = beside(hypothesis, z, step, shot)
-    assert (len(told.points) < hypothesis.dimension) == fewer
+    told = beside(hypothesis, z, step, fly)
+    assert (len(told.batch) < hypothesis.dimension) == fewer
     for k in range(hypothesis.dimension):
         alone = z.copy()
         alone[k] += step[k]
@@ -99,9 +99,9 @@ def test_stretches_that_nodes_keep_apart_share_rollouts(distance, effect):
     hypothesis = dataclasses.replace(Hypothesis(Space.around(one)), nodes=tuple(nodes)).added(extra)
     simulator, asked = MujocoSimulator(one.shapes, 30.0, 1), []
 
-    def fly(points):
-        asked.append(len(points))
-        return simulator.shot(hypothesis.batch(points), FRAMES)
+    def fly(batch):
+        asked.append(len(batch))
+        return simulator.shot(batch, FRAMES)
 
     z, step = np.zeros(hypothesis.dimension), np.full(hypothesis.dimension, 0.01)
     told = beside(hypothesis, z, step, fly)
@@ -109,12 +109,12 @@ def test_stretches_that_nodes_keep_apart_share_rollouts(distance, effect):
     most = 1 + np.sum(hypothesis.owners < 0) + 12 + 7
     assert (sum(asked) <= most) == (distance == 1.5 and effect != "dropped_frames")
     change = told.change_of_missed(missing(hypothesis.nodes))
-    (still,), (begun,) = fly(z[None])[0], missed_of(hypothesis, z, fly)
+    (still,), (begun,) = fly(hypothesis.batch(z[None]))[0], missed_of(hypothesis, z, fly)
     for k in range(hypothesis.dimension):
         alone = z.copy()
         alone[k] += step[k]
         found = np.where(told.felt[k, :2, None], told.poses[told.row[k]], still)
-        assert found == pytest.approx(fly(alone[None])[0][0], abs=1e-8)
+        assert found == pytest.approx(fly(hypothesis.batch(alone[None]))[0][0], abs=1e-8)
         assert change[k] == pytest.approx(missed_of(hypothesis, alone, fly)[0] - begun, abs=1e-6)
 
 
@@ -122,7 +122,8 @@ NODES, FRAMES = ((0, 4), (1, 6), (0, 8)), 12
 
 
 def missed_of(hypothesis, z, fly):
-    return missed_by(hypothesis.nodes, fly(z[None])[1], hypothesis.batch(z[None]).restarts)
+    batch = hypothesis.batch(z[None])
+    return missed_by(hypothesis.nodes, fly(batch)[1], batch.restarts)
 
 
 def test_effects_that_couple_objects_keep_rollouts_apart(monkeypatch):
@@ -135,9 +136,9 @@ def test_effects_that_couple_objects_keep_rollouts_apart(monkeypatch):
         hypothesis,
         z,
         z + 0.01,
-        lambda points: (simulator.rollout(hypothesis.batch(points), 12), np.zeros((len(points), 0, 13))),
+        lambda batch: (simulator.rollout(batch, 12), np.zeros((len(batch), 0, 13))),
     )
-    assert len(told.points) == 1 + hypothesis.dimension
+    assert len(told.batch) == 1 + hypothesis.dimension
     assert told.felt.all()
 
 
@@ -146,14 +147,14 @@ def test_where_a_moved_object_meets_another_rollouts_are_made_again(monkeypatch)
     hypothesis = Hypothesis(Space.around(one))
     simulator, asked = MujocoSimulator(one.shapes, 30.0, 1), []
 
-    def shot(points):
-        asked.append(len(points))
-        return simulator.rollout(hypothesis.batch(points), 12), np.zeros((len(points), 0, 13))
+    def fly(batch):
+        asked.append(len(batch))
+        return simulator.rollout(batch, 12), np.zeros((len(batch), 0, 13))
 
     told = iter([np.zeros((2, 2), bool), ~np.eye(2, dtype=bool)])
     monkeypatch.setattr(apart, "meetings", lambda poses, radius: next(told))
     z = np.zeros(hypothesis.dimension)
-    found = beside(hypothesis, z, z + 0.01, shot)
+    found = beside(hypothesis, z, z + 0.01, fly)
     assert len(asked) == 3
     assert found.felt.all()
-    assert len(found.points) == 1 + hypothesis.dimension
+    assert len(found.batch) == 1 + hypothesis.dimension
