@@ -52,6 +52,10 @@ ANEW = 20.0
 withheld exams, those better by 11, 16 and 26 led to nothing, as did those by 45 and 57, and those by 32 and 53 to what leads
 then."""
 
+IN_PLACE = 0.25
+"""Part of the best effect's lead that a push must have for an obstacle, and a patch, to be looked for in its place: a push of any
+direction explains most of what either does."""
+
 CLEAR = 40.0
 """Lead of an effect from which the noise is taken anew from what it leaves."""
 
@@ -204,7 +208,9 @@ def _in_place_of_pushes(
 ) -> None:
     """An obstacle, and a patch, begin where a push was found; ``asked`` are those pushes for which that was done before."""
     pushes = [(target, *found) for (name, target), found in fitted.items() if name == "push"]
-    pushes = [row for row in pushes if row[1].evidence >= base.evidence + 3.0 and not any(row[1] is w for w in asked)]
+    most = max((fit.evidence for fit, _ in fitted.values()), default=base.evidence) - base.evidence
+    least = base.evidence + max(3.0, IN_PLACE * most)
+    pushes = [row for row in pushes if row[1].evidence >= least and not any(row[1] is w for w in asked)]
     asked += [fit for _, fit, _ in pushes]
     if "hidden_obstacle" in names:
         rows = [(fit, view, base.cost) for _, fit, _ in pushes]

@@ -239,3 +239,22 @@ def test_two_effects_are_looked_for_where_a_second_promises_something_beside_the
     assert bool(begun) == looked_for
     # What was found with more noise stands either way.
     assert found is None or found == twos
+
+
+@pytest.mark.parametrize(("push", "best", "asked"), [(24.0, 100.0, 0), (26.0, 100.0, 1), (2.0, 2.0, 0), (4.0, 4.0, 1)])
+def test_obstacles_and_patches_are_looked_for_in_place_of_pushes_that_lead_by_enough(monkeypatch, push, best, asked):
+    seen: list[int] = []
+
+    def nothing(clip, rows, *told):
+        seen.append(len(rows))
+        return [None] * len(rows)
+
+    monkeypatch.setattr(singles, "walls_from_pushes", nothing)
+    monkeypatch.setattr(singles, "patches_from_pushes", nothing)
+    base: Any = SimpleNamespace(evidence=-500.0, cost=500.0)
+    fitted: Any = {
+        (name, 0): (SimpleNamespace(evidence=-500.0 + lead), 0.0) for name, lead in (("shape", best), ("push", push))
+    }
+    names, nobody = ["hidden_obstacle", "friction_patch"], cast(Any, None)
+    singles._in_place_of_pushes(nobody, base, fitted, [], nobody, names, nobody)
+    assert seen == [asked, asked]
