@@ -14,6 +14,8 @@ from mjx_refine.diagnosis.exchange import alone
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import FIRST, FORGIVING
+from mjx_refine.diagnosis.lost import NAME as LOST
+from mjx_refine.diagnosis.lost import lost_frames
 from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.pairs import annealed_pairs, pairs_of
 from mjx_refine.diagnosis.scattered import WORTH, fairly
@@ -87,7 +89,9 @@ def compare(
         return view_of(clip, fit, observation, masks_of)
 
     settled = clip.settled
-    shots = _shot(clip, base, (), names, scene, shown, seed, told) if video else None
+    hits = video and bool(with_nodes(clip, base).hypothesis.nodes)
+    lost = lost_frames(clip, base, shown(base)) if hits and LOST in names else ()
+    shots = _shot(clip, base, lost, names, scene, shown, seed, told) if video else None
     if shots is not None and _explained(clip, shots):
         return shots
     clip.settled = settled
@@ -129,11 +133,14 @@ def _shot(
       seed: of what is drawn.
       told: called with a line for each step.
     """
-    there = with_nodes(clip, max([base, *(one.fit for one in before[:1])], key=lambda fit: fit.evidence))
-    if not there.hypothesis.nodes:
+    paths = [base, *(one.fit for one in before[:1])]
+    # Frames that are missing may only seem to be: then the base model's own impacts are the better ones.
+    paths = paths if before and before[0].names == (LOST,) else [max(paths, key=lambda fit: fit.evidence)]
+    theres = [there for there in (with_nodes(clip, fit) for fit in paths) if there.hypothesis.nodes]
+    if not theres:
         return None
     told("from impact to impact")
-    base = base_with_nodes(clip, base, there, seed)
+    base = base_with_nodes(clip, base, theres, seed)
     base, singles, _ = singles_of(clip, base, names, scene, shown, seed, told, True, found_before(clip, base, before))
     impacts = sum(len(n.struck) for n in base.hypothesis.nodes)
     if singles and singles[0].lead > CLEAR:

@@ -4,6 +4,7 @@ differ by bends nothing."""
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -43,19 +44,23 @@ def with_nodes_of(fit: Fit, other: Fit) -> Fit:
     return dataclasses.replace(fit, hypothesis=dataclasses.replace(fit.hypothesis, nodes=their.nodes), z=z)
 
 
-def base_with_nodes(clip: ClipFit, base: Fit, there: Fit, seed: int) -> Fit:
+def base_with_nodes(clip: ClipFit, base: Fit, theres: Sequence[Fit], seed: int) -> Fit:
     """The base model's fit with nodes, and noise as it is taken from what that leaves.
 
     Args:
       clip: residuals.
       base: the base model's fit without nodes.
-      there: a fit with nodes, of the base model or with an effect, which then is gone.
+      theres: fits with nodes, of the base model or with an effect, which then is gone; whose nodes explain most are kept.
       seed: of what is drawn.
     """
-    plain = dataclasses.replace(there.hypothesis, terms=(), slack=None)
-    bare = dataclasses.replace(there, hypothesis=plain, z=there.z[: plain.dimension])
-    fits = clip.crew.each(clip, _fitted, [(one, FIRST) for one in (with_nodes_of(base, there), bare)])
-    found = min(fits, key=lambda fit: fit.cost)
+    rows: list[tuple[Fit, int]] = []
+    for there in theres:
+        plain = dataclasses.replace(there.hypothesis, terms=(), slack=None)
+        bare = dataclasses.replace(there, hypothesis=plain, z=there.z[: plain.dimension])
+        rows += [(with_nodes_of(base, there), FIRST), (bare, FIRST)]
+    fits = clip.crew.each(clip, _fitted, rows)
+    pairs = zip(fits[::2], fits[1::2], strict=True)
+    found = max((min(two, key=lambda fit: fit.cost) for two in pairs), key=lambda fit: fit.evidence)
     clip.settle_noise(found)
     clip.allow_chaos(found, seed)
     clip.allow_slack(found)

@@ -141,7 +141,7 @@ def test_nodes_take_up_what_an_engine_does_not_know_of_an_impact(bounced):
     clip, base = bounced
     before = clip.fit(dataclasses.replace(base.hypothesis, slack=clip.slack_along(base)), base.z, 20)
     kept = clip.settled
-    fit = base_with_nodes(clip, before, with_nodes(clip, before), 0)
+    fit = base_with_nodes(clip, before, [with_nodes(clip, before)], 0)
     clip.settled = kept
     same = clip.at(fit.hypothesis, fit.z)
     assert clip.misfit(same) < clip.misfit(before)
