@@ -44,9 +44,10 @@ class Loading:
         """For how long the loads and the floor's friction surely stay as they are [s]."""
         least = np.inf
         for kind, e in self._looking:
-            least = min(least, kind.idle(motion, e.target, e.values))
-            if least == 0.0:
-                break
+            told = kind.idle(motion, e.target, e.values)
+            if told == 0.0 or np.isnan(told):
+                return told
+            least = min(least, told)
         return least
 
     def loads(self, motion: Motion) -> Loads | None:
