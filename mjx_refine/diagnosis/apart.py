@@ -89,9 +89,12 @@ def _shared(hypothesis: Hypothesis, company: np.ndarray) -> tuple[np.ndarray, np
     # What is shown twice may be of two stretches.
     if not hypothesis.nodes or any(t.kind.retimes for t in hypothesis.terms):
         return rows, rows
-    by_itself = np.isin(company, np.nonzero(np.bincount(company) == 1)[0])
-    stretches = np.where((owners >= 0) & by_itself[owners], hypothesis.stretches, whole)
-    return rows, moved_together(owners, company, moves, stretches)
+    return rows, moved_together(owners, company, moves, _stretches(hypothesis, company))
+
+
+def _stretches(hypothesis: Hypothesis, company: np.ndarray) -> np.ndarray:
+    """``Hypothesis.stretches`` of objects that meet no other; what others meet changes their paths, too."""
+    return np.where(np.bincount(company)[company][hypothesis.owners] == 1, hypothesis.stretches, WHOLE)
 
 
 def _stepped(hypothesis: Hypothesis, z: np.ndarray, steps: np.ndarray) -> SceneBatch:
@@ -114,12 +117,12 @@ def _told_apart(
     hypothesis: Hypothesis, company: np.ndarray, rows: np.ndarray, shared: np.ndarray, still: Flight, flown: Flight
 ) -> Flight:
     """What would have been simulated at points where coordinates are moved as in ``rows``, from rollouts in which more were."""
-    owners, stretches, nodes = hypothesis.owners, hypothesis.stretches, hypothesis.nodes
+    owners, stretches, nodes = hypothesis.owners, _stretches(hypothesis, company), hypothesis.nodes
     poses, arrived = (np.repeat(s, len(rows), 0) for s in still)
     for coordinate, (row, rollout) in enumerate(zip(rows.argmax(0), shared.argmax(0), strict=True)):
-        owner, stretch = owners[coordinate], stretches[coordinate]
+        owner = owners[coordinate]
         felt = company == company[owner] if owner >= 0 else np.ones(len(company), bool)
-        begin, end = hypothesis.frames_of(owner, stretch if felt.sum() == 1 else WHOLE, poses.shape[1])
+        begin, end = hypothesis.frames_of(owner, stretches[coordinate], poses.shape[1])
         poses[row, begin:end, felt] = flown[0][rollout, begin:end, felt]
         ends = [k for k, node in enumerate(nodes) if felt[node.target] and begin < node.frame <= end]
         arrived[row, ends] = flown[1][rollout, ends]

@@ -19,7 +19,8 @@ NAME = "dropped_frames"
 
 PROMISED, ITERATIONS, ROUNDS = 60.0, 8, 4
 """Evidence that the linear look must promise and the fit must lead by, iterations of least squares, and how often the frame and
-the count beside the best are tried."""
+the count beside the best are tried. The first was chosen once frames missing at impacts of two clips had promised 240 and 461,
+and four clips without any 9 at most; the others were not tried otherwise."""
 
 
 def lost_frames(clip: ClipFit, base: Fit, view: FitView) -> tuple[Candidate, ...]:

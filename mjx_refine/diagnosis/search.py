@@ -89,9 +89,7 @@ def compare(
         return view_of(clip, fit, observation, masks_of)
 
     settled = clip.settled
-    hits = video and bool(with_nodes(clip, base).hypothesis.nodes)
-    lost = lost_frames(clip, base, shown(base)) if hits and LOST in names else ()
-    shots = _shot(clip, base, lost, names, scene, shown, seed, told) if video else None
+    shots = _shot(clip, base, (), names, scene, shown, seed, told) if video else None
     if shots is not None and _explained(clip, shots):
         return shots
     clip.settled = settled
@@ -126,17 +124,21 @@ def _shot(
     Args:
       clip: residuals; noise is as it was where None is told.
       base: the base model's fit without such states.
-      before: effects that were found without.
+      before: effects that were found without; none: frames that are missing are looked for.
       names: of the catalogue.
       scene: the given one.
       shown: what a fit shows to those who look for a start.
       seed: of what is drawn.
       told: called with a line for each step.
     """
-    paths = [base, *(one.fit for one in before[:1])]
-    # Frames that are missing may only seem to be: then the base model's own impacts are the better ones.
-    paths = paths if before and before[0].names == (LOST,) else [max(paths, key=lambda fit: fit.evidence)]
-    theres = [there for there in (with_nodes(clip, fit) for fit in paths) if there.hypothesis.nodes]
+    theres = [with_nodes(clip, base)]
+    if not before and theres[0].hypothesis.nodes and LOST in names:
+        before = lost_frames(clip, base, shown(base))
+    if before and (before[0].names == (LOST,) or before[0].fit.evidence > base.evidence):
+        theres.append(with_nodes(clip, before[0].fit))
+        # Frames that are missing may only seem to be: then the base model's own impacts are the better ones.
+        theres = theres if before[0].names == (LOST,) else theres[1:]
+    theres = [there for there in theres if there.hypothesis.nodes]
     if not theres:
         return None
     told("from impact to impact")

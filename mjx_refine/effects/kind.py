@@ -146,7 +146,7 @@ class Motion:
 
     def spin_of(self, target: int) -> Float[np.ndarray, "batch 3"]:
         """Angular velocity of one body [rad/s]."""
-        return rotations.turned(rotations.matrix(self.quaternion[:, target]), self.turning[:, target])
+        return rotations.rotate(self.quaternion[:, target], self.turning[:, target])
 
 
 Loads = tuple[Float[np.ndarray, "batch objects 3"], Float[np.ndarray, "batch objects 3"]]

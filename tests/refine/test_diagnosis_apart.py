@@ -14,6 +14,13 @@ from mjx_refine.scene import Body, Camera, Scene
 from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.space import Space
 
+NODES, FRAMES = ((0, 4), (1, 6), (0, 8)), 12
+
+
+def missed_of(hypothesis, z, fly):
+    batch = hypothesis.batch(z[None])
+    return missed_by(hypothesis.nodes, fly(batch)[1], batch.restarts)
+
 
 def path(*places):
     """Poses of bodies whose centres are at these places, frame by frame."""
@@ -116,14 +123,6 @@ def test_stretches_that_nodes_keep_apart_share_rollouts(distance, effect):
         found = np.where(told.felt[k, :2, None], told.poses[told.row[k]], still)
         assert found == pytest.approx(fly(hypothesis.batch(alone[None]))[0][0], abs=1e-8)
         assert change[k] == pytest.approx(missed_of(hypothesis, alone, fly)[0] - begun, abs=1e-6)
-
-
-NODES, FRAMES = ((0, 4), (1, 6), (0, 8)), 12
-
-
-def missed_of(hypothesis, z, fly):
-    batch = hypothesis.batch(z[None])
-    return missed_by(hypothesis.nodes, fly(batch)[1], batch.restarts)
 
 
 def test_effects_that_couple_objects_keep_rollouts_apart(monkeypatch):

@@ -54,13 +54,13 @@ def test_nothing_is_missing_where_nothing_is():
 def test_of_several_paths_those_impacts_are_kept_that_explain_most(dropped):
     clip, base, view = dropped
     (found,) = lost_frames(clip, base, view)
-    kept, evidence = clip.settled, {}
+    kept, evidence = clip.settled, []
     mine, other = with_nodes(clip, base), with_nodes(clip, found.fit)
     for theres in ([mine], [other], [mine, other]):
         clip.settled = kept
         fit = base_with_nodes(clip, base, theres, 0)
         # In the noise before it was taken from the fit's own residuals.
         clip.settled = kept
-        evidence[len(evidence)] = clip.at(fit.hypothesis, fit.z, scale=SCALE).evidence
+        evidence.append(clip.at(fit.hypothesis, fit.z, scale=SCALE).evidence)
     clip.settled = kept
-    assert evidence[2] == pytest.approx(max(evidence[0], evidence[1]), abs=5.0)
+    assert evidence[2] == pytest.approx(max(evidence[:2]), abs=5.0)
