@@ -31,7 +31,8 @@ effects are looked at beside each."""
 HOPE = 30.0
 """What a second effect must promise beside the best, in units of the misfit left, for two to be looked for where none of those
 that were found with more noise leads it. In 19 clips with effects of seeds 28 to 30 of the withheld exams the best second one
-promised 172 at least where two were named, 8 to 67 where two act and were not, and 22 at most where one acts."""
+promised (evidence, not in such units) 172 at least where two were named, 8 to 67 where two act and were not, and 22 at most where
+one acts."""
 
 JOINED, LOOK, TOGETHER = 4, 4, 6
 """Of how many of the best effects twos are put together, after how many steps their fits are compared, how many of these go on:
