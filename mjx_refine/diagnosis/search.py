@@ -43,7 +43,8 @@ takes off less than half, and a camera that shakes had made twenty times too muc
 EXPLAINED = 1.25
 """Mean square residual below which a hypothesis with states of its own after impacts explains a clip, and no others are looked
 for. Of thirteen clips of seeds 22 to 31 of the withheld exams whose best one had left 1.25 and more two are right since it was 2
-(063 of seed 23, whose masks are 5 px too thin, and 037 of seed 31, a ``shape`` that was none), and none is wrong that had been right."""
+(063 of seed 23, whose masks are 5 px too thin, and 037 of seed 31, a ``shape`` that was none), and none is wrong that had been
+right."""
 
 THIN = 1.0
 """How much too thin masks are from which on those of objects that hide one another do not touch [px]."""
