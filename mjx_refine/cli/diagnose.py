@@ -72,6 +72,7 @@ def diagnose(context: click.Context, init, video, poses, out: Path, seed: int, w
         diagnosis, call, clip = _diagnosed(inputs, call, withheld, seed, threads, steps.told, store)
         steps.told("report")
         from mjx_refine.report.diagnosis_files import write_diagnosis
+        from mjx_refine.report.diagnosis_words import in_words
 
         write_diagnosis(out, diagnosis, clip, call)
         store.clear()
@@ -82,7 +83,7 @@ def diagnose(context: click.Context, init, video, poses, out: Path, seed: int, w
         raise click.exceptions.Exit(1) from None
     finally:
         steps.close()
-    click.echo(f"{diagnosis.verdict.sentence} (probability {diagnosis.verdict.probability:.2f}); {out}/report.html")
+    click.echo("\n".join([*in_words(diagnosis), f"{out}/report.html"]))
     for note in diagnosis.notes:
         click.echo(f"refine: {note}", err=True)
 

@@ -13,8 +13,9 @@ from benchmarks.bad_cases import scene_text
 from mjx_refine import diagnosis as package
 from mjx_refine.cli.diagnose import best_sample
 from mjx_refine.cli.main import run
-from mjx_refine.diagnosis.result import Diagnosis, Gap, Place, Ranked, Value, Verdict
+from mjx_refine.diagnosis.result import NONE, UNKNOWN, Diagnosis, Gap, Place, Ranked, Value, Verdict
 from mjx_refine.observation import load_observation, save_observation
+from mjx_refine.report.diagnosis_words import in_words
 from mjx_refine.scene import Effect, load_scene, load_scenes
 from mjx_refine.simulate import simulate
 
@@ -75,7 +76,13 @@ CALL = ["diagnose", "--init", "scene.yaml", "--video", "flows.npz", "--out", "ou
 def test_a_good_call(folder, asked, capsys):
     assert run([*CALL, "--seed", "7", "--without", "magnus", "--without", "wind", "--without", "magnus"]) == 0
     out, err = capsys.readouterr()
-    assert out == "sphere_0 is slowed by the air. (probability 0.93); out/report.html\n"
+    assert out.splitlines() == [
+        "sphere_0 is slowed by the air. (probability 0.93)",
+        "  drag of sphere_0: linear 0.2 N s/m (0.1 … 0.3)",
+        "  where: sphere_0, frames 1–5, flight, motion (80 % of the gap)",
+        "  held-out gap: 4 → 1.2, 93 % closed (80 % … 99 %), noise alone 1; frames 4-5",
+        "out/report.html",
+    ]
     assert err == "refine: a note\n"
     ((scene, observation, options),) = asked
     assert scene == load_scene("scene.yaml")
@@ -89,6 +96,29 @@ def test_a_good_call(folder, asked, capsys):
     assert numbers["call"]["without"] == ["magnus", "wind"]
     assert load_scene("out/diagnosed.yaml").effects[0].effect == "drag"
     assert sorted(path.name for path in folder.iterdir()) == ["flows.npz", "out", "scene.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("effects", "lines"),
+    [
+        (
+            UNKNOWN,
+            [
+                "Said. (probability 0.93)",
+                "  where: the whole view, frames 0–3, whole, camera (90 % of the gap)",
+                "  the gap: It lags.",
+            ],
+        ),
+        (NONE, ["Said. (probability 0.93)"]),
+    ],
+)
+def test_in_words_where_nothing_is_named(folder, effects, lines):
+    scene = load_scene("scene.yaml")
+    told = answer(scene)
+    verdict = dataclasses.replace(told.verdict, effects=effects, sentence="Said.")
+    where = (*told.where, Place(None, (0, 3), "whole", "camera", 0.9))
+    said = in_words(dataclasses.replace(told, verdict=verdict, where=where, scene=scene))
+    assert said == [*lines, "  held-out gap: 4, noise alone 1; frames 4-5"]
 
 
 def test_the_diagnosed_scene_can_be_simulated(folder, asked):
