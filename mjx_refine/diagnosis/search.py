@@ -21,7 +21,7 @@ from mjx_refine.diagnosis.pairs import annealed_pairs, pairs_of
 from mjx_refine.diagnosis.scattered import WORTH, fairly
 from mjx_refine.diagnosis.shooting import base_with_nodes, found_before, with_nodes
 from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.signs import best_candidate
+from mjx_refine.diagnosis.signs import best_candidate, structure
 from mjx_refine.diagnosis.singles import CLEAR, CLOSE, SOME_OF_IT, singles_of
 from mjx_refine.diagnosis.tempered import Shown, Told
 from mjx_refine.effects import catalogue
@@ -45,6 +45,9 @@ EXPLAINED = 1.25
 for. Of thirteen clips of seeds 22 to 31 of the withheld exams whose best one had left 1.25 and more two are right since it was 2
 (063 of seed 23, whose masks are 5 px too thin, and 037 of seed 31, a ``shape`` that was none), and none is wrong that had been
 right."""
+
+SMOOTH = 1.3
+"""The same of how smooth in time its residuals are (``signs.structure``)."""
 
 THIN = 1.0
 """How much too thin masks are from which on those of objects that hide one another do not touch [px]."""
@@ -155,10 +158,12 @@ def _shot(
 
 
 def _explained(clip: ClipFit, compared: Compared) -> bool:
-    """Whether some hypothesis leaves little more than noise, and masks are not too thin, of which others may hide more."""
+    """Whether some hypothesis leaves little more than noise, in size and in time, and masks are not too thin, of which others may
+    hide more."""
     best = best_candidate(compared)
-    left = clip.misfit(best.fit if best else compared.base)
-    return left < EXPLAINED and thinness(compared.candidates) < THIN
+    fit = best.fit if best else compared.base
+    like_noise = clip.misfit(fit) < EXPLAINED and structure(clip, fit) < SMOOTH
+    return like_noise and thinness(compared.candidates) < THIN
 
 
 def _as_found_together(

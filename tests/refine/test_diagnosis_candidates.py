@@ -10,9 +10,18 @@ import numpy as np
 import pytest
 from test_diagnosis import FLIGHT
 
-from mjx_refine.diagnosis import candidates, pairs, singles
+from mjx_refine.diagnosis import candidates, pairs, search, singles
 from mjx_refine.diagnosis.base import base_space
-from mjx_refine.diagnosis.candidates import AGAINST, AT_IMPACT, DOUBT, LEAST_UNIT, Candidate, in_order, lead_of
+from mjx_refine.diagnosis.candidates import (
+    AGAINST,
+    AT_IMPACT,
+    DOUBT,
+    LEAST_UNIT,
+    Candidate,
+    Compared,
+    in_order,
+    lead_of,
+)
 from mjx_refine.diagnosis.fitted import Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.walls import push_last
@@ -258,3 +267,13 @@ def test_obstacles_and_patches_are_looked_for_in_place_of_pushes_that_lead_by_en
     names, nobody = ["hidden_obstacle", "friction_patch"], cast(Any, None)
     singles._in_place_of_pushes(nobody, base, fitted, [], nobody, names, nobody)
     assert seen == [asked, asked]
+
+
+@pytest.mark.parametrize(
+    ("misfit", "smooth", "explained"), [(1.0, 0.5, True), (1.4, 0.5, False), (1.0, 2.0, False), (1.0, 1.2, True)]
+)
+def test_what_leaves_more_than_noise_or_is_smooth_in_time_is_not_explained(monkeypatch, misfit, smooth, explained):
+    monkeypatch.setattr(search, "structure", lambda clip, fit: smooth)
+    clip: Any = SimpleNamespace(misfit=lambda fit: misfit)
+    base: Any = object()
+    assert search._explained(clip, Compared(base, (), (), 0)) is explained
