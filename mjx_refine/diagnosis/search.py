@@ -48,7 +48,7 @@ right."""
 
 SMOOTH = 1.3
 """The same of how smooth in time its residuals are (``signs.structure``): of twelve clips of seeds 28 to 32 whose best such one
-was smoother four were tried: three, which had been ``unknown``, are right since, and one is as it was."""
+was smoother six were tried: three, which had been ``unknown``, are right since, and three are as they were."""
 
 THIN = 1.0
 """How much too thin masks are from which on those of objects that hide one another do not touch [px]."""
