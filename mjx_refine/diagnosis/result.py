@@ -181,7 +181,7 @@ class Diagnosis:
     Attributes:
       verdict: the answer.
       gap: how far it closes the gap.
-      where: the places of the gap, the largest share first.
+      where: the places of the gap.
       candidates: effects, the likeliest first.
       residual: what the gap looks like, in words.
       remaining: what is left after the verdict's effects, in words.
@@ -217,6 +217,16 @@ class Diagnosis:
     rollouts: int
     pose_errors: PoseErrors | None = None
     clips: tuple[ClipGap, ...] = ()
+
+    @property
+    def added(self) -> list[str]:
+        """Names of the effects that the diagnosed scene has, and the base model's has not."""
+        return [effect.effect for effect in self.scene.effects if effect not in self.base.effects]
+
+    @property
+    def places(self) -> list[Place]:
+        """``where``, the largest share first."""
+        return sorted(self.where, key=lambda place: -place.share)
 
 
 CHANNELS = ("motion", "rotation", "shape", "camera", "timing", "perception")

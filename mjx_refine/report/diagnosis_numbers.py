@@ -35,9 +35,7 @@ def diagnosis_numbers(diagnosis: Diagnosis, call: Mapping[str, Any] | None = Non
             "experiment": verdict.experiment,
         },
         "gap": _gap(diagnosis.gap),
-        "where": [
-            {**_place(place), "share": _rounded(max(0.0, place.share), 4)} for place in _sorted_places(diagnosis)
-        ],
+        "where": [{**_place(place), "share": _rounded(max(0.0, place.share), 4)} for place in diagnosis.places],
         "candidates": [_candidate(one) for one in diagnosis.candidates],
         "residual": {"description": diagnosis.residual, "remaining": diagnosis.remaining},
         "objects": [
@@ -65,10 +63,6 @@ def diagnosis_numbers(diagnosis: Diagnosis, call: Mapping[str, Any] | None = Non
 def diagnosis_json(diagnosis: Diagnosis, call: Mapping[str, Any] | None = None) -> str:
     """``diagnosis_numbers`` as strict JSON."""
     return json.dumps(diagnosis_numbers(diagnosis, call), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _sorted_places(diagnosis: Diagnosis):
-    return sorted(diagnosis.where, key=lambda place: -place.share)
 
 
 def _place(place: Place) -> dict[str, Any]:

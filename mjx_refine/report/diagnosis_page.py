@@ -39,9 +39,8 @@ def diagnosis_page(
       call: what was asked for; ``init``, ``video``, ``seed``, ``without`` are shown.
     """
     environment = _environment()
-    added = [effect.effect for effect in diagnosis.scene.effects if effect not in diagnosis.base.effects]
-    changed = bool(added)
-    label = "with " + " and ".join(added) if changed else ""
+    changed = bool(diagnosis.added)
+    label = "with " + " and ".join(diagnosis.added) if changed else ""
     map_panels = [Rows("base model, refitted", diagnosis.map_before)]
     if changed:
         map_panels.append(Rows(label, diagnosis.map_after))
@@ -60,7 +59,7 @@ def diagnosis_page(
         channels=[(name, CHANNEL_COLOURS[name]) for k, name in enumerate(CHANNELS) if k in present],
         top=top_of(*maps),
         unseen=any(np.isnan(m).any() for m in maps),
-        places=sorted(diagnosis.where, key=lambda place: -place.share),
+        places=diagnosis.places,
         residual=diagnosis.residual,
         remaining=diagnosis.remaining,
         candidates=candidate_rows(diagnosis),

@@ -22,6 +22,12 @@ def percent(value: float) -> str:
     return f"{100 * value:.0f} %".replace("-", "−")
 
 
+def closed_between(gap: Gap) -> str:
+    """The interval of how much of the gap is closed; empty where it is not known."""
+    known = math.isfinite(gap.closed_low) and math.isfinite(gap.closed_high)
+    return f"{percent(gap.closed_low)} … {percent(gap.closed_high)}" if known else ""
+
+
 def width(value: float) -> str:
     """A share as a CSS width."""
     return f"{100 * min(max(value, 0.0), 1.0):.1f}%" if math.isfinite(value) else "0%"
@@ -49,11 +55,10 @@ def gap_tiles(gap: Gap, changed: bool) -> list[GapTile]:
             GapTile("IoU, whole clip", fixed(gap.iou_before), "", "base model", True),
             GapTile("End-point error, whole clip", fixed(gap.epe_before), "px", "base model", True),
         ]
-    interval = ""
-    if math.isfinite(gap.closed_low) and math.isfinite(gap.closed_high):
-        interval = f"90 % interval {percent(gap.closed_low)} … {percent(gap.closed_high)}"
+    interval = closed_between(gap)
+    was = f"90 % interval {interval}" if interval else ""
     return [
-        GapTile("Gap closed", percent(gap.closed), "", interval, not gap.closed < 0),
+        GapTile("Gap closed", percent(gap.closed), "", was, not gap.closed < 0),
         GapTile(
             "Gap", number(gap.after, 3), "", f"before {number(gap.before, 3)}, {floor}", not gap.after > gap.before
         ),

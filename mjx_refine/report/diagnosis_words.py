@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 from mjx_refine.diagnosis.result import NONE, UNKNOWN, Diagnosis, Place
-from mjx_refine.report.diagnosis_tables import CandidateRow, ValueText, candidate_rows, percent
+from mjx_refine.report.diagnosis_tables import CandidateRow, ValueText, candidate_rows, closed_between, percent
 from mjx_refine.report.tables import number
 
 
@@ -19,7 +17,7 @@ def in_words(diagnosis: Diagnosis) -> list[str]:
     lines = [f"{verdict.sentence} (probability {verdict.probability:.2f})"]
     lines += [_named(row) for row in candidate_rows(diagnosis) if row.chosen]
     if verdict.effects != NONE and diagnosis.where:
-        lines.append(_where(max(diagnosis.where, key=lambda place: place.share)))
+        lines.append(_where(diagnosis, diagnosis.places[0]))
     if verdict.effects == UNKNOWN and diagnosis.residual:
         lines.append(f"  the gap: {diagnosis.residual}")
     return [*lines, _gap(diagnosis)]
@@ -35,8 +33,8 @@ def _value(value: ValueText) -> str:
     return f"{value.name} {value.value}{f' {value.unit}' if value.unit else ''}{interval}"
 
 
-def _where(place: Place) -> str:
-    clip = "" if place.clip is None else f" of clip {place.clip}"
+def _where(diagnosis: Diagnosis, place: Place) -> str:
+    clip = "" if place.clip is None else f" of {diagnosis.clips[place.clip].source}"
     object_or_view = place.object or "the whole view"
     return (
         f"  where: {object_or_view}, frames {place.frames[0]}–{place.frames[1]}{clip}, {place.phase}, {place.channel} "
@@ -47,8 +45,7 @@ def _where(place: Place) -> str:
 def _gap(diagnosis: Diagnosis) -> str:
     gap = diagnosis.gap
     floor = f"noise alone {number(gap.noise_floor, 3)}; {gap.held_out}"
-    if not set(diagnosis.scene.effects) - set(diagnosis.base.effects):
+    if not diagnosis.added:
         return f"  held-out gap: {number(gap.before, 3)}, {floor}"
-    known = math.isfinite(gap.closed_low) and math.isfinite(gap.closed_high)
-    interval = f" ({percent(gap.closed_low)} … {percent(gap.closed_high)})" if known else ""
+    interval = f" ({between})" if (between := closed_between(gap)) else ""
     return f"  held-out gap: {number(gap.before, 3)} → {number(gap.after, 3)}, {percent(gap.closed)} closed{interval}, {floor}"

@@ -13,7 +13,7 @@ from benchmarks.bad_cases import scene_text
 from mjx_refine import diagnosis as package
 from mjx_refine.cli.diagnose import best_sample
 from mjx_refine.cli.main import run
-from mjx_refine.diagnosis.result import NONE, UNKNOWN, Diagnosis, Gap, Place, Ranked, Value, Verdict
+from mjx_refine.diagnosis.result import NONE, UNKNOWN, ClipGap, Diagnosis, Gap, Place, Ranked, Value, Verdict
 from mjx_refine.observation import load_observation, save_observation
 from mjx_refine.report.diagnosis_words import in_words
 from mjx_refine.scene import Effect, load_scene, load_scenes
@@ -119,6 +119,14 @@ def test_in_words_where_nothing_is_named(folder, effects, lines):
     where = (*told.where, Place(None, (0, 3), "whole", "camera", 0.9))
     said = in_words(dataclasses.replace(told, verdict=verdict, where=where, scene=scene))
     assert said == [*lines, "  held-out gap: 4, noise alone 1; frames 4-5"]
+
+
+def test_in_words_a_place_is_of_its_clip(folder):
+    told = answer(load_scene("scene.yaml"))
+    where = tuple(dataclasses.replace(place, clip=1) for place in told.where)
+    clips = (ClipGap("a.npz", True, 2.0, 1.0), ClipGap("b.npz", False, 2.0, 1.0))
+    said = in_words(dataclasses.replace(told, where=where, clips=clips))
+    assert said[2] == "  where: sphere_0, frames 1–5 of b.npz, flight, motion (80 % of the gap)"
 
 
 def test_the_diagnosed_scene_can_be_simulated(folder, asked):
