@@ -18,7 +18,7 @@ from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.nodes import missed_by, missing, with_struck
 from mjx_refine.diagnosis.noise import Counts, Noise, blurred, everywhere, jagged, settled
-from mjx_refine.diagnosis.pace import STEPS, Effort, Standing, descended
+from mjx_refine.diagnosis.pace import STEPS, Differences, Effort, Standing, descended
 from mjx_refine.diagnosis.predict import Prediction, Predictor
 from mjx_refine.diagnosis.roam import ROAMED, Strategy, hopped, looked_around
 from mjx_refine.diagnosis.settled import Loose, Settled
@@ -348,15 +348,16 @@ class ClipFit:
         return self._descended(fit.hypothesis, start, None, SCALE, Effort(iterations, rival, None, thorough))
 
     def _descended(self, hypothesis: Hypothesis, start, keep, scale: float, effort: Effort) -> Fit:
-        ended = descended(
-            start,
-            lambda points: self.residuals(hypothesis, points, keep, scale),
-            lambda z, _, size: self.jacobian(hypothesis, z, keep, scale, size),
-            functools.partial(prior, hypothesis),
-            hypothesis.bounds,
-            effort,
-        )
+        told = self._differences(hypothesis, keep, scale)
+        ended = descended(start, told, functools.partial(prior, hypothesis), effort)
         return self._finished(hypothesis, ended.z, ended.base, ended.slopes, keep, ended.ended)
+
+    def _differences(self, hypothesis: Hypothesis, keep, scale: float) -> Differences:
+        return Differences(
+            lambda points: self.residuals(hypothesis, points, keep, scale),
+            lambda z, size: self.jacobian(hypothesis, z, keep, scale, size),
+            hypothesis.bounds,
+        )
 
     def best_of(self, hypothesis: Hypothesis, points: Float[np.ndarray, "points dimension"], keep=None) -> np.ndarray:
         """The point with the least cost."""
@@ -391,8 +392,8 @@ class ClipFit:
 
     def at(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE) -> Fit:
         """No step, just what holds at ``z``."""
-        base, _ = self.residuals(hypothesis, z[None], keep, scale)
-        return self._finished(hypothesis, z, base[0], self.jacobian(hypothesis, z, keep, scale), keep)
+        (base,), _ = self.residuals(hypothesis, z[None], keep, scale)
+        return self._finished(hypothesis, z, base, self._differences(hypothesis, keep, scale).surest(z, base), keep)
 
 
 def _made(shapes: tuple[Shape, ...], fps: float, measured: Measured, image, frames: int, threads: int) -> ClipFit:

@@ -1,0 +1,89 @@
+"""Least squares over jags: which differences tell derivatives, and where they lead."""
+
+import numpy as np
+import pytest
+
+from mjx_refine.diagnosis.pace import OWN, STEPS, Differences, Effort, descended
+
+SLOPES = np.random.default_rng(0).normal(size=(40, 3)) * [30.0, 10.0, 3.0]
+BOUNDS = np.full(3, -5.0), np.full(3, 5.0)
+TRUE = np.array([0.3, -0.4, 0.6])
+
+
+def jags(z, jagged, size=0.4):
+    """What jumps each time one of the numbers passes a multiple of 1e-4, by another amount each time, of standard deviation
+    ``size``."""
+    cells = np.floor(z[..., jagged] * 1e4).astype(int)
+    rows = [np.random.default_rng(np.abs(cell) + 7).normal(size=len(SLOPES)) for cell in cells.reshape(-1, len(jagged))]
+    return size * np.reshape(rows, (*z.shape[:-1], len(SLOPES)))
+
+
+def differences_of(jagged, curved=0.0):
+    """Of residuals that are linear in three numbers but for a curvature, and jump with some of these."""
+
+    def residuals(points):
+        flat = (points - TRUE) @ SLOPES.T
+        rows = flat + curved * flat * np.abs(flat) + (jags(points, jagged) if jagged else 0.0)
+        return rows, 0.5 * (rows**2).sum(1) + 0.5 * (points**2).sum(1)
+
+    def jacobian(z, size):
+        step = np.broadcast_to(size, z.shape)
+        moved, _ = residuals(z + np.diag(step))
+        return ((moved - residuals(z[None])[0]) / step[:, None]).T
+
+    return Differences(residuals, jacobian, BOUNDS)
+
+
+def prior(z):
+    return z, np.ones(len(z))
+
+
+def test_without_jags_the_smallest_differences_are_the_surest():
+    """What is smooth, and bends, is told by the smallest ones, bit for bit."""
+    differences = differences_of([], curved=0.02)
+    z = np.zeros(3)
+    told = differences.surest(z, differences.residuals(z[None])[0][0])
+    np.testing.assert_array_equal(told, differences.of(z, np.zeros(40), STEPS[0]))
+    assert differences.tried(True) == STEPS
+
+
+def test_a_number_with_jags_is_told_by_longer_differences_and_the_others_are_not():
+    """A jump of 0.4 over a difference of 0.002 is 200, and slopes are 3 to 30."""
+    differences = differences_of([1])
+    z = np.zeros(3)
+    told = differences.surest(z, differences.residuals(z[None])[0][0])
+    fine = differences.of(z, np.zeros(40), STEPS[0])
+    np.testing.assert_array_equal(told[:, [0, 2]], fine[:, [0, 2]])
+    assert np.linalg.norm(fine[:, 1]) > 10 * np.linalg.norm(SLOPES[:, 1])
+    assert np.linalg.norm(told[:, 1] - SLOPES[:, 1]) < 0.5 * np.linalg.norm(SLOPES[:, 1])
+    assert differences.tried(False) == (OWN, STEPS[0])
+
+
+def test_the_posterior_is_not_made_narrower_by_jags():
+    """Its volume with jags is that without, within a tenth of a standard deviation in each number or so."""
+    z = np.zeros(3)
+
+    def volume(told):
+        return 0.5 * np.linalg.slogdet(told.T @ told + np.eye(3))[1]
+
+    jagged = differences_of([0, 1, 2])
+    base = jagged.residuals(z[None])[0][0]
+    wrong = volume(jagged.of(z, base, STEPS[0]))
+    assert volume(jagged.surest(z, base)) == pytest.approx(volume(SLOPES), abs=0.6)
+    assert wrong > volume(SLOPES) + 5
+
+
+def test_least_squares_cross_the_jags():
+    """From a start four prior widths off least squares end at the truth, as far as jags let them."""
+    ended = descended(np.array([4.0, 4.0, -4.0]), differences_of([0, 1, 2]), prior, Effort(12))
+    assert np.abs(ended.z - TRUE).max() < 0.2
+    assert ended.ended
+
+
+def test_least_squares_go_on_from_where_they_were_interrupted_over_jags_too():
+    """The rough derivatives that an interrupted fit ends with do not hide which differences are needed."""
+    differences = differences_of([0, 1, 2])
+    stopped = descended(np.array([4.0, 4.0, -4.0]), differences, prior, Effort(12, attempts=1))
+    assert not stopped.ended
+    ended = descended(stopped, differences_of([0, 1, 2]), prior, Effort(12))
+    assert np.abs(ended.z - TRUE).max() < 0.2
