@@ -82,7 +82,21 @@ def annealed(
     found = _of_their_families(list(zip(leads, fits, strict=True)))[:GO_ON]
     with tempered(clip, COOLER):
         ground, *fits = clip.crew.each(clip, _further, [(ground,), *((fit,) for _, fit in found)])
-        found = _cheapest([(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)], END)
+        found = [(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)]
+        if len(found) < GO_ON:
+            # So much noise hides what acts weakly.
+            known = {(lead.name, lead.target) for lead, _ in found}
+            leads = [
+                lead
+                for lead in Screen(clip, ground, shown(ground)).leads(names)
+                if (lead.name, lead.target) not in known
+            ]
+            leads = chosen_of(leads, FAMILIES - len(found), 1)
+            fits = clip.crew.each(
+                clip, _first, [(ground, lead) for lead in leads], told, [lines(lead) for lead in leads]
+            )
+            found += _of_their_families(list(zip(leads, fits, strict=True)))
+        found = _cheapest(found, END)
         # The base model goes the same way: else an effect would lead that has only found better ordinary numbers.
         ground, *fits = clip.crew.each(clip, _roamed, [(ground, seed), *((fit, seed) for _, fit in found[:ROAMING])])
     unbent = [*fits, *(fit for _, fit in found[ROAMING:])]
