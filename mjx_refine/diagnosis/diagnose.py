@@ -12,10 +12,11 @@ import numpy as np
 from mjx_refine.children import cores
 from mjx_refine.compile_cache import enable_cache
 from mjx_refine.diagnosis.base import grip_notes
-from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared
+from mjx_refine.diagnosis.candidates import Candidate, Compared
 from mjx_refine.diagnosis.crew import Crew, crew_of
 from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.heldout import HeldOut, held_out
+from mjx_refine.diagnosis.heldout import HeldOut
+from mjx_refine.diagnosis.judged import Judged, judged
 from mjx_refine.diagnosis.knock import strike_notes
 from mjx_refine.diagnosis.measure import Measured, measure
 from mjx_refine.diagnosis.mismatch import matched, moved_by
@@ -24,10 +25,9 @@ from mjx_refine.diagnosis.replay import Replay, replays
 from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Verdict
 from mjx_refine.diagnosis.search import compare
 from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.signs import MOSTLY, Signs, best_candidate, map_of, signs
+from mjx_refine.diagnosis.signs import best_candidate, map_of
 from mjx_refine.diagnosis.store import Store
-from mjx_refine.diagnosis.unnamed import freely_forced
-from mjx_refine.diagnosis.verdict import NAMED, Answer, answer, upheld
+from mjx_refine.diagnosis.verdict import Answer
 from mjx_refine.diagnosis.where import describe, misfit_map, places
 from mjx_refine.effects.kind import FitView
 from mjx_refine.errors import InputError
@@ -92,36 +92,27 @@ def _diagnosed(
     clip = ClipFit(Recalling(problem.reference(scene.shapes)), measured, observation.size, observation.length)
     clip.store, clip.crew = store or clip.store, crew
     crew.warm(clip)
-    compared = compare(clip, start.scene, observation, start.matching, without, seed, told)
-    told("held-out frames")
-    judged: dict[int, HeldOut] = {}
-
-    def outside_of(fit: Fit | None) -> HeldOut:
-        if id(fit) not in judged:
-            judged[id(fit)] = held_out(clip, compared.base, fit)
-        return judged[id(fit)]
-
-    best = best_candidate(compared)
-    outside = outside_of(best.fit if best else None)
 
     def shown(fit: Fit) -> FitView:
         return view_of(clip, fit, observation, start.matching, hidden=False)
 
-    seen = shown(compared.base)
-    aloft = (seen.on_floor.mean(0) < MOSTLY).any()
-    if aloft or (best is not None and best.lead > NAMED * max(clip.misfit(best.fit), LEAST_UNIT)):
-        told("a force without a name")
-        freed = freely_forced(clip, compared, best.fit if best else compared.base, seen, shown)
-        compared = dataclasses.replace(compared, freed=freed)
-    found = signs(clip, compared, outside.gain, outside.closed)
-    leads = [c.lead for c in compared.candidates]
-    said = upheld(answer(found, leads, video=True), compared, found, lambda fit: outside_of(fit).closed, video=True)
+    kept: list[tuple[Compared, Judged]] = []
+
+    def judge(compared: Compared) -> Judged:
+        if not kept or kept[-1][0] is not compared:
+            kept.append((compared, judged(clip, compared, shown, told)))
+        return kept[-1][1]
+
+    def enough(compared: Compared) -> bool:
+        return judge(compared).said.kind != UNKNOWN
+
+    found = judge(compare(clip, start.scene, observation, start.matching, without, seed, told, enough=enough))
     told("report")
-    result = _result(clip, compared, outside_of, found, said, problem, observation, start.matching, seed, began)
+    result = _result(clip, found, problem, observation, start.matching, seed, began)
     # What moves is not all that there is: without masks nobody knows what should overlap.
     if observation.masks is None:
         return result
-    return matched(result, moved_by([compared.base, *([best.fit] if best else [])]))
+    return matched(result, moved_by([found.compared.base, *([found.best.fit] if found.best else [])]))
 
 
 def prepared(scene: Scene, observation: Observation, threads: int | None) -> tuple[Problem, Start, Measured]:
@@ -219,19 +210,16 @@ def _by_name(compared: Compared, said: Answer) -> dict[str, float]:
     return result
 
 
-def _result(
-    clip, compared, outside_of, found: Signs, said: Answer, problem, observation, matching, seed, began
-) -> Diagnosis:
-    base = compared.base
+def _result(clip, found: Judged, problem, observation, matching, seed, began) -> Diagnosis:
+    compared, said, base = found.compared, found.said, found.compared.base
     names, shapes = base.hypothesis.space.scene.names, base.hypothesis.space.scene.shapes
-    leading = best_candidate(compared)
-    outside = outside_of(leading.fit if leading else None)
+    outside = found.outside_of(found.best.fit if found.best else None)
     gap = float(np.sqrt(np.mean(outside.before**2)))
     # Up to a noise width nothing is above the noise, as the report says of every place.
     left = gap / max(outside.floor, 1e-9) if gap > 1.0 else 1.0
     verdict, best = verdict_of(compared, said, names, shapes, left)
     shown = best.fit if best else base
-    outside = outside_of(best.fit) if best else dataclasses.replace(outside, after=outside.before)
+    outside = found.outside_of(best.fit) if best else dataclasses.replace(outside, after=outside.before)
     view = view_of(clip, shown, observation, matching, hidden=False)
     where = places(clip, base, best.fit if best else None, view)
     candidates = tuple(ranked(clip, compared, said, outside, best))
@@ -256,7 +244,7 @@ def _result(
         map_after=map_after,
         channels=channels,
         notes=(*_unmatched(problem.seen.ids, matching), *_notes(clip, compared, said, matching, names, best)),
-        signs=dataclasses.asdict(found),
+        signs=dataclasses.asdict(found.signs),
         seconds=time.monotonic() - began,
         rollouts=int(clip.rollouts),
     )

@@ -64,6 +64,7 @@ def compare(
     seed: int,
     told: Told,
     begin: Callable[[], Fit] | None = None,
+    enough: Callable[[Compared], bool] = lambda compared: True,
 ) -> Compared:
     """Fits the base model, then what the linear look promises.
 
@@ -76,6 +77,7 @@ def compare(
       seed: of random hops.
       told: called with a line for each step.
       begin: makes the base model's first fit, where not pictures but poses were measured.
+      enough: whether hypotheses that explain a clip also give an answer, so that no others need to be looked for.
     """
     told("base model")
     base = begin() if begin is not None else stored_base(clip, with_grips(base_space(scene)), observation, masks_of)
@@ -97,7 +99,7 @@ def compare(
 
     settled = clip.settled
     shots = _shot(clip, base, (), names, scene, shown, seed, told) if video else None
-    if shots is not None and _explained(clip, shots):
+    if shots is not None and _explained(clip, shots) and enough(shots):
         return shots
     clip.settled = settled
     base, singles, unbent = singles_of(clip, base, names, scene, shown, seed, told, video, {})
