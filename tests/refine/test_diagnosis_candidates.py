@@ -277,3 +277,39 @@ def test_what_leaves_more_than_noise_or_is_smooth_in_time_is_not_explained(monke
     clip: Any = SimpleNamespace(misfit=lambda fit: misfit)
     base: Any = object()
     assert search._explained(clip, Compared(base, (), (), 0)) is explained
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_what_is_explained_but_gives_no_answer_is_looked_into_further(monkeypatch, answers):
+    """A fit with states after impacts is the end only where an answer comes of it."""
+    shots: Any = object()
+    fit: Any = SimpleNamespace(hypothesis=None, z=np.zeros(2))
+    silent = {name: lambda *a, **k: fit for name in ("fit", "roam", "settle_noise", "allow_chaos", "allow_slack")}
+    clip: Any = SimpleNamespace(settled=None, **silent)
+
+    def further(*rest):
+        raise StopIteration
+
+    for name, value in (("_shot", shots), ("_explained", True), ("_of_own_contacts", fit)):
+        monkeypatch.setattr(search, name, lambda *a, value=value: value)
+    monkeypatch.setattr(search, "stored_base", lambda *a: fit)
+    monkeypatch.setattr(search, "base_space", lambda scene: None)
+    monkeypatch.setattr(search, "with_grips", lambda space: None)
+    monkeypatch.setattr(search, "singles_of", further)
+    asked: list[Any] = []
+
+    def enough(compared):
+        asked.append(compared)
+        return answers
+
+    nobody = cast(Any, None)
+
+    def compared():
+        return search.compare(clip, nobody, nobody, (), (), 0, lambda line: None, enough=enough)
+
+    if answers:
+        assert compared() is shots
+    else:
+        with pytest.raises(StopIteration):
+            compared()
+    assert asked == [shots]

@@ -13,6 +13,8 @@ from test_diagnosis_replay import started
 from mjx_refine.diagnosis.base import base_space
 from mjx_refine.diagnosis.diagnose import _unmatched
 from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.leads import chosen_of
+from mjx_refine.diagnosis.screen import Screen
 from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.diagnosis.tempered import annealed, beside_tempered, cooled, tempered
 from mjx_refine.scene import Effect
@@ -99,3 +101,25 @@ def test_a_second_effect_is_found_beside_the_first(blown):
 def test_masks_without_an_object_are_told_of(matching, words):
     told = _unmatched((1, 2, 4), matching)
     assert told == [] if words is None else words in told[0]
+
+
+def test_what_the_most_noise_hides_is_looked_for_with_less():
+    """Nothing promises anything in this wind where noise is ten times what it is; with three times something does."""
+    wind = Effect("wind", None, (("x", -3.0), ("y", 2.0)))
+    observation = clip_of(dataclasses.replace(FLIGHT, effects=(wind,)), 30)
+    _, start, clip = started(FLIGHT, observation)
+    hypothesis = Hypothesis(base_space(start.scene))
+    base = clip.fit(hypothesis, np.zeros(hypothesis.dimension), 10)
+    clip.settle_noise(base)
+    clip.allow_slack(base)
+
+    def shown(fit):
+        return view_of(clip, fit, observation, start.matching)
+
+    names = ["wind", "drag", "camera_roll", "mask_bias", "push"]
+    with tempered(clip, 10.0):
+        ground = clip.fit(dataclasses.replace(base.hypothesis, slack=None), 0 * base.z, 10)
+        promised = chosen_of(Screen(clip, ground, shown(ground)).leads(names), 10, 1)
+    assert not promised
+    _, ended, _ = annealed(clip, base, names, shown, 0, quiet, lambda lead: lead.name)
+    assert max(fit.evidence for _, fit in ended) > base.evidence + 100
