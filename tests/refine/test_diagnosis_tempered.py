@@ -25,16 +25,21 @@ WIND, ROLL = (
 )
 
 
-@pytest.fixture(scope="module")
-def blown():
-    """Residuals of a flight in the wind that a rolled camera filmed, its base model at the given scene, and what is shown."""
-    observation = clip_of(dataclasses.replace(FLIGHT, effects=(WIND, ROLL)), 30)
+def started_with(*effects: Effect):
+    """Residuals of a flight with effects, its base model's fit from the given scene, and what is shown."""
+    observation = clip_of(dataclasses.replace(FLIGHT, effects=effects), 30)
     _, start, clip = started(FLIGHT, observation)
     hypothesis = Hypothesis(base_space(start.scene))
     base = clip.fit(hypothesis, np.zeros(hypothesis.dimension), 10)
     clip.settle_noise(base)
     clip.allow_slack(base)
     return clip, base, lambda fit: view_of(clip, fit, observation, start.matching)
+
+
+@pytest.fixture(scope="module")
+def blown():
+    """A flight in the wind that a rolled camera filmed."""
+    return started_with(WIND, ROLL)
 
 
 def quiet(line: str) -> None:
@@ -105,17 +110,7 @@ def test_masks_without_an_object_are_told_of(matching, words):
 
 def test_what_the_most_noise_hides_is_looked_for_with_less():
     """Nothing promises anything in this wind where noise is ten times what it is; with three times something does."""
-    wind = Effect("wind", None, (("x", -3.0), ("y", 2.0)))
-    observation = clip_of(dataclasses.replace(FLIGHT, effects=(wind,)), 30)
-    _, start, clip = started(FLIGHT, observation)
-    hypothesis = Hypothesis(base_space(start.scene))
-    base = clip.fit(hypothesis, np.zeros(hypothesis.dimension), 10)
-    clip.settle_noise(base)
-    clip.allow_slack(base)
-
-    def shown(fit):
-        return view_of(clip, fit, observation, start.matching)
-
+    clip, base, shown = started_with(Effect("wind", None, (("x", -3.0), ("y", 2.0))))
     names = ["wind", "drag", "camera_roll", "mask_bias", "push"]
     with tempered(clip, 10.0):
         ground = clip.fit(dataclasses.replace(base.hypothesis, slack=None), 0 * base.z, 10)
