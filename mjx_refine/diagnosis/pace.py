@@ -108,11 +108,7 @@ class Differences:
         told, sizes = self._fine(z), np.full(len(z), STEPS[0])
         if self._tells_jags(z, base, told):
             for shorter, size in itertools.pairwise(STEPS):
-                longer = self._jacobian(z, size)
-                # A number that was told without a jag stays: over a longer step the robust loss may make less of it.
-                jagged = np.linalg.norm(told, axis=0) > JAGGED * np.linalg.norm(longer, axis=0)
-                jagged &= (sizes == shorter) & longer.any(0)
-                told, sizes = np.where(jagged, longer, told), np.where(jagged, size, sizes)
+                told, sizes = without_jags(told, sizes, shorter, self._jacobian(z, size), size)
         self._sizes = sizes
         return told
 
@@ -123,10 +119,36 @@ class Differences:
 
     def _tells_jags(self, z: np.ndarray, base: np.ndarray, slopes: np.ndarray) -> bool:
         """Whether a longer step in all numbers at once changes far less than the derivatives tell."""
-        signs = np.random.default_rng(len(z)).choice([-1.0, 1.0], len(z))
-        point = np.clip(z + STEPS[1] / np.sqrt(len(z)) * signs, *self.bounds)
+        point = probe(z, self.bounds)
         (moved,), _ = self.residuals(point[None])
-        return float(np.linalg.norm(slopes @ (point - z))) > JAGGED * float(np.linalg.norm(moved - base))
+        return tells_jags(slopes @ (point - z), moved - base)
+
+
+def probe(z: Float[np.ndarray, "dimension"], bounds: tuple[np.ndarray, np.ndarray]) -> Float[np.ndarray, "dimension"]:
+    """A longer step away in all numbers at once."""
+    signs = np.random.default_rng(len(z)).choice([-1.0, 1.0], len(z))
+    return np.clip(z + STEPS[1] / np.sqrt(len(z)) * signs, *bounds)
+
+
+def tells_jags(told: Float[np.ndarray, "residuals"], change: Float[np.ndarray, "residuals"]) -> bool:
+    """Whether derivatives tell a far larger change than there is."""
+    return float(np.linalg.norm(told)) > JAGGED * float(np.linalg.norm(change))
+
+
+def without_jags(
+    told: Float[np.ndarray, "residuals dimension"],
+    sizes: Float[np.ndarray, "dimension"],
+    shorter: float,
+    longer: Float[np.ndarray, "residuals dimension"],
+    size: float,
+) -> tuple[Float[np.ndarray, "residuals dimension"], Float[np.ndarray, "dimension"]]:
+    """Derivatives with those columns, and their sizes, of longer differences of which the shorter ones tell a jag.
+
+    A number that was told without a jag stays: over a longer step the robust loss may make less of it.
+    """
+    jagged = np.linalg.norm(told, axis=0) > JAGGED * np.linalg.norm(longer, axis=0)
+    jagged &= (sizes == shorter) & longer.any(0)
+    return np.where(jagged, longer, told), np.where(jagged, size, sizes)
 
 
 class Effort(NamedTuple):

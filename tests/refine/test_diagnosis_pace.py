@@ -1,8 +1,11 @@
 """Least squares over jags: which differences tell derivatives, and where they lead."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from mjx_refine.diagnosis.joint.differences import JointDifferences
 from mjx_refine.diagnosis.pace import OWN, STEPS, Differences, Effort, descended
 
 SLOPES = np.random.default_rng(0).normal(size=(40, 3)) * [30.0, 10.0, 3.0]
@@ -87,3 +90,50 @@ def test_least_squares_go_on_from_where_they_were_interrupted_over_jags_too():
     assert not stopped.ended
     ended = descended(stopped, differences_of([0, 1, 2]), prior, Effort(12))
     assert np.abs(ended.z - TRUE).max() < 0.2
+
+
+# --- several clips ----------------------------------------------------------------------------------------------------
+
+
+def joint_differences_of(*jagged):
+    """Of clips that share two numbers and have one each of their own; of each: which of its numbers have jags."""
+    clips = [differences_of(list(which)) for which in jagged]
+    index = [np.array([0, 1, 2 + c]) for c in range(len(clips))]
+    asked = []
+
+    def split(z):
+        return [z[..., own] for own in index]
+
+    def residuals(points):
+        told = [clip.residuals(own) for clip, own in zip(clips, split(points), strict=True)]
+        return [rows for rows, _ in told], sum(costs for _, costs in told)
+
+    def jacobians(z, base, sizes):
+        asked.append(list(sizes))
+        rows = zip(clips, split(z), sizes, strict=True)
+        return [None if size is None else clip._jacobian(own, size) for clip, own, size in rows]
+
+    bounds = np.full(2 + len(clips), -5.0), np.full(2 + len(clips), 5.0)
+    return JointDifferences(SimpleNamespace(split=split, bounds=bounds), residuals, jacobians), asked
+
+
+def test_a_clip_with_jags_is_told_by_longer_differences_and_the_others_cost_nothing_more():
+    """A shared number may jump in one clip and be smooth in another."""
+    differences, asked = joint_differences_of([1], [])
+    z = np.zeros(4)
+    base = [rows[0] for rows in differences.residuals(z[None])[0]]
+    jagged, smooth = differences.surest(z, base)
+    assert [sizes[1] for sizes in asked] == [STEPS[0], None, None]
+    assert np.linalg.norm(jagged[:, 1] - SLOPES[:, 1]) < 0.5 * np.linalg.norm(SLOPES[:, 1])
+    np.testing.assert_allclose(smooth, SLOPES, atol=1e-9)
+    again = differences.of(z, base, OWN)
+    np.testing.assert_array_equal(again[0], jagged)
+    assert differences.tried() == (OWN, *STEPS)
+
+
+def test_clips_without_jags_are_told_by_the_smallest_differences():
+    differences, asked = joint_differences_of([], [])
+    base = [rows[0] for rows in differences.residuals(np.zeros((1, 4)))[0]]
+    differences.surest(np.zeros(4), base)
+    assert asked == [[STEPS[0], STEPS[0]]]
+    assert differences.tried() == STEPS

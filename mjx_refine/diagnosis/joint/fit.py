@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -12,8 +13,9 @@ from mjx_refine.batch import concatenate
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit, prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.joint.arrow import Arrow
+from mjx_refine.diagnosis.joint.differences import JointDifferences, Sizes
 from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis, with_frozen_setup
-from mjx_refine.diagnosis.pace import DAMPINGS, STEPS, Pace, behind
+from mjx_refine.diagnosis.pace import DAMPINGS, Pace, behind
 from mjx_refine.diagnosis.store import Arrays, fingerprint, packed, remembered, unpacked
 from mjx_refine.effects.loading import has_loads
 
@@ -164,21 +166,33 @@ class Clips:
         white = clip.whitened(clip.distances(prediction), None if keeps is None else keeps[c], scale)
         return white, prediction.bad
 
-    def jacobians(self, hypothesis: JointHypothesis, z, base, keeps: Keeps = None, scale=SCALE, size=STEPS[0]):
-        """d residuals / d z of each clip in its own coordinates, (R, part)."""
+    def jacobians(self, hypothesis: JointHypothesis, z, base, sizes: Sizes, keeps: Keeps = None, scale=SCALE):
+        """d residuals / d z of each clip in its own coordinates, (R, part), by differences of its sizes; None for no sizes."""
         points, steps, moved = [], [], []
-        for part, at in zip(hypothesis.parts, hypothesis.split(z), strict=True):
-            step = np.where(at + size > part.bounds[1], -size, size)
-            points.append(np.clip(at + np.diag(step), *part.bounds))
-            steps.append(step)
-            moved.append(np.concatenate([at[None], points[-1][part.moves]]))
-        result = []
+        for part, at, size in zip(hypothesis.parts, hypothesis.split(z), sizes, strict=True):
+            step = (
+                np.zeros((0, len(at))) if size is None else np.diag(np.where(at + size > part.bounds[1], -size, size))
+            )
+            points.append(np.clip(at + step, *part.bounds))
+            steps.append(np.diag(step))
+            moved.append(np.concatenate([at[None], points[-1][part.moves[: len(step)]]]))
+        result: list[Any] = []
         for c, poses in enumerate(self.poses(hypothesis, moved)):
+            if sizes[c] is None:
+                result.append(None)
+                continue
             whole = np.repeat(poses[:1], len(points[c]), 0)
             whole[hypothesis.parts[c].moves] = poses[1:]
             white, bad = self._white(c, hypothesis.parts[c], points[c], whole, keeps, scale)
             result.append((np.where(bad[:, None], 0.0, white - base[c]) / steps[c][:, None]).T)
         return result
+
+    def _differences(self, hypothesis: JointHypothesis, keeps: Keeps, scale: float) -> JointDifferences:
+        return JointDifferences(
+            hypothesis,
+            lambda points: self.residuals(hypothesis, points, keeps, scale),
+            lambda z, base, sizes: self.jacobians(hypothesis, z, base, sizes, keeps, scale),
+        )
 
     # --- least squares --------------------------------------------------------------------------------------------
     @remembered
@@ -196,8 +210,9 @@ class Clips:
         z = np.clip(z, low, high)
         rows, costs = self.residuals(hypothesis, z[None], keeps, scale)
         base, cost = [row[0] for row in rows], float(costs[0])
-        pace = Pace()
-        fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale))
+        told = self._differences(hypothesis, keeps, scale)
+        fit, surest = self._finished(hypothesis, z, base, told.surest(z, base)), True
+        pace = Pace(told.tried())
         for attempt in range(1, iterations + 1):
             gradient, curvature = fit.gradient, fit.curvature
             trials = np.array([_step(z, gradient, curvature, f, low, high) for f in DAMPINGS * pace.damping])
@@ -208,15 +223,13 @@ class Clips:
                 z, base, cost = trials[best], [row[best] for row in rows], float(costs[best])
             if pace.done(gain, best, cost) or behind(attempt, cost, rival):
                 break
-            fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale, pace.size))
-        if pace.size != STEPS[0] or fit.z is not z:
-            fit = self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale))
-        return fit
+            fit, surest = self._finished(hypothesis, z, base, told.of(z, base, pace.size)), False
+        return fit if surest and fit.z is z else self._finished(hypothesis, z, base, told.surest(z, base))
 
     def at(self, hypothesis: JointHypothesis, z: np.ndarray, keeps: Keeps = None, scale: float = SCALE) -> JointFit:
         """No step, just what holds at ``z``."""
         base = [row[0] for row in self.residuals(hypothesis, z[None], keeps, scale)[0]]
-        return self._finished(hypothesis, z, base, self.jacobians(hypothesis, z, base, keeps, scale))
+        return self._finished(hypothesis, z, base, self._differences(hypothesis, keeps, scale).surest(z, base))
 
     def best_of(self, hypothesis: JointHypothesis, points: np.ndarray) -> np.ndarray:
         """The point with the least cost."""
