@@ -254,7 +254,8 @@ def _gap(outside: HeldOut, first: Replay, last: Replay, seed: int) -> Gap:
     before, after = (float(np.sqrt(np.mean(v**2))) for v in (outside.before, outside.after))
     low, high = outside.interval(seed)
     return Gap(
-        metric="centroids, outlines, flow, background against the clip, root mean square over held-out frames, in noise widths",
+        metric="centroids, outlines, what flow on and beside objects has in common: root mean square over held-out frames, in "
+        "noise widths",
         held_out="every third block of three frames",
         before=before,
         after=after,

@@ -266,18 +266,18 @@ class ClipFit:
         white = Parts(*parts).flat()
         return white if keep is None else white * self.measured.kept(keep)
 
-    def expected(self, beside: bool = True) -> float:
-        """Sum of squares that noise alone would give, with the background's or without."""
+    def expected(self, without: tuple[str, ...] = ()) -> float:
+        """Sum of squares that noise alone would give; ``without`` some of the parts."""
         parts, fresh = self.measured.parts, self.measured.freshness[..., None]
         seen = Parts(*(np.isfinite(part).astype(float) for part in parts))
         seen = seen._replace(reach=seen.reach * fresh, moments=seen.moments * fresh)
-        each = [count * float(part.sum()) for count, part in zip(self.counts.of(parts), seen, strict=True)]
-        return max(sum(each if beside else each[:-1]), 1.0)
+        told = zip(Parts._fields, self.counts.of(parts), seen, strict=True)
+        return max(sum(count * float(part.sum()) for name, count, part in told if name not in without), 1.0)
 
     def misfit(self, fit: Fit) -> float:
         """Mean square residual of the objects in noise widths."""
         seen = self.known(fit)[: self.measured.objects.size - self.measured.background.size]
-        return float((seen**2).sum()) / self.expected(beside=False)
+        return float((seen**2).sum()) / self.expected(without=("background",))
 
     def rollout(self, batch: SceneBatch, frames: int) -> np.ndarray:
         """The simulator's, counted."""

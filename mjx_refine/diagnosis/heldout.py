@@ -1,4 +1,9 @@
-"""The gap on frames that no fit has seen."""
+"""The gap on frames that no fit has seen.
+
+Of flow the gap holds what a picture, or a surface, moves by in common: the rest is how flow errs where it was measured, which no
+hypothesis closes. (A magnus force of 053 of seed 33 of the withheld exams, which leaves 1.09 of the 4.55 noise widths squared on
+the objects, closed 0.19 of a gap in which three frames of invented background stood for most, and closes 0.82.)
+"""
 
 from __future__ import annotations
 
@@ -7,6 +12,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mjx_refine.diagnosis.common_motion import affine, similar
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 
 BLOCK = 3
@@ -22,17 +28,24 @@ class HeldOut:
       after: ditto by the other.
       floor: ditto by noise alone.
       gain: evidence that the other gains there [natural logarithms].
+      of_all: ``closed`` of the gap in which all flow counts, with how it errs; None where there is no flow.
     """
 
     before: Float[np.ndarray, "held"]
     after: Float[np.ndarray, "held"]
     floor: float
     gain: float
+    of_all: float | None = None
 
     @property
     def closed(self) -> float:
         """(before - after) / (before - floor)."""
         return _closed(self.before, self.after, self.floor)
+
+    @property
+    def closed_of_all(self) -> float:
+        """The same of the gap in which all flow counts: the verdict's rules were counted on that."""
+        return self.closed if self.of_all is None else self.of_all
 
     def interval(self, seed: int) -> tuple[float, float]:
         """90 % bootstrap interval of ``closed`` over blocks of frames (Kuensch 1989)."""
@@ -66,28 +79,56 @@ def held_out(clip: ClipFit, base: Fit, other: Fit | None) -> HeldOut:
     frames = np.nonzero(~keep & seen)[0]
     if len(frames) == 0:
         frames = np.nonzero(~keep)[0]
-    floor = float(np.sqrt(np.mean(_rough(clip, other or base)[frames])))
-    gain = 0.5 * float((first - second).sum()) * clip.expected() / max(clip.frames, 1)
-    return HeldOut(np.sqrt(first[frames]), np.sqrt(second[frames]), floor, gain)
+    noise = _rough(clip, other or base)
+    gain = 0.5 * float((first.all - second.all)[~keep].sum()) * clip.expected() / max(clip.frames, 1)
+    of_all = _closed(np.sqrt(first.all[frames]), np.sqrt(second.all[frames]), _mean(noise.all[frames]))
+    before, after = np.sqrt(first.common[frames]), np.sqrt(second.common[frames])
+    return HeldOut(before, after, _mean(noise.common[frames]), gain, of_all)
 
 
-def _outside(clip: ClipFit, fit: Fit, keep: np.ndarray) -> np.ndarray:
-    """Mean square residual of every frame [noise widths squared], zero in the kept ones."""
+def _mean(squares: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(squares)))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Energy:
+    """Mean square residual of every frame [noise widths squared].
+
+    Attributes:
+      all: of all that was measured.
+      common: of outlines and centroids, with what flow has in common.
+    """
+
+    all: Float[np.ndarray, "frames"]
+    common: Float[np.ndarray, "frames"]
+
+
+def _outside(clip: ClipFit, fit: Fit, keep: np.ndarray) -> _Energy:
     again = clip.fit(fit.hypothesis, fit.z, 6, keep=keep)
     batch = again.hypothesis.batch(again.z[None])
     distances = clip.distances(clip.predictor(clip.poses(again.hypothesis, again.z[None]), batch))
-    return np.where(keep, 0.0, _by_frame(clip, clip.whitened(distances, None, 20.0, again.hypothesis)[0]))
+    return _by_frame(clip, clip.whitened(distances, None, 20.0, again.hypothesis)[0])
 
 
-def _by_frame(clip: ClipFit, white: np.ndarray) -> np.ndarray:
+def _by_frame(clip: ClipFit, white: np.ndarray) -> _Energy:
     """Sum of squares of each frame's residuals over what noise alone gives."""
-    parts = clip.measured.split(white)
-    total = (parts.reach**2).sum((1, 2)) + (parts.moments**2).sum((1, 2))
-    total[:-1] += (parts.flow**2).sum((1, 2, 3)) + (parts.background**2).sum((1, 2))
-    return total / max(clip.expected() / clip.frames, 1e-9)
+    parts, measured = clip.measured.split(white), clip.measured
+    still = (parts.reach**2).sum((1, 2)) + (parts.moments**2).sum((1, 2))
+    moved, common = np.zeros(len(still)), np.zeros(len(still))
+    moved[:-1] = (parts.flow**2).sum((1, 2, 3)) + (parts.background**2).sum((1, 2))
+    beside = np.atleast_1d(np.isfinite(measured.background).all(-1))
+    for t in range(len(still) - 1):
+        common[t] = similar(parts.background[t, beside[t]], measured.places[beside[t]])
+        for flow, seen, pixels in zip(parts.flow[t], measured.flow[t], measured.pixels[t], strict=True):
+            on = np.isfinite(seen).all(-1)
+            common[t] += affine(flow[on], pixels[on])
+    whole, outlines = (
+        max(told / clip.frames, 1e-9) for told in (clip.expected(), clip.expected(("flow", "background")))
+    )
+    return _Energy((still + moved) / whole, (still + common) / outlines)
 
 
-def _rough(clip: ClipFit, fit: Fit) -> np.ndarray:
+def _rough(clip: ClipFit, fit: Fit) -> _Energy:
     """What of a fit's residuals changes from frame to frame, as noise does: by frame, in the same units."""
     parts = []
     for series in clip.measured.split(fit.residual):

@@ -58,7 +58,9 @@ def judged(clip: ClipFit, compared: Compared, shown: Shown, told: Told) -> Judge
         told("a force without a name")
         freed = freely_forced(clip, compared, best.fit if best else compared.base, seen, shown)
         compared = dataclasses.replace(compared, freed=freed)
-    found = signs(clip, compared, outside.gain, outside.closed)
+    found = signs(clip, compared, outside.gain, outside.closed_of_all)
     leads = [c.lead for c in compared.candidates]
-    said = upheld(answer(found, leads, video=True), compared, found, lambda fit: outside_of(fit).closed, video=True)
+    said = upheld(
+        answer(found, leads, video=True), compared, found, lambda fit: outside_of(fit).closed_of_all, video=True
+    )
     return Judged(compared, best, outside_of, found, said)

@@ -48,7 +48,7 @@ class Signs:
       structure_after: ditto of the best hypothesis'.
       held_out: gain on held-out frames of the best hypothesis over the base model, in the same units.
       whole: mean square residual of the base model, background included.
-      closed: part of the gap on held-out frames that the best hypothesis closes; 1 where that is not asked.
+      closed: part of the gap on held-out frames, all flow in it, that the best hypothesis closes; 1 where that is not asked.
       structure_first: ``structure_after`` of the best single effect.
       beside: 1 where one of the best two effects moves the camera, which the background shows, and the other does not, nor
         widens masks, as a camera that is not quite right seems to.

@@ -37,9 +37,19 @@ def walls_from_pushes(
       lines: one a fit.
     """
     begun = clip.crew.each(clip, _facings, [(fit, view) for fit, view, _ in pushes], told, lines)
-    rows = [(*row, rival) for rows, (_, _, rival) in zip(begun, pushes, strict=True) for row in rows]
-    fits = iter(clip.crew.each(clip, _wall, rows))
-    return [max((next(fits) for _ in rows), key=lambda wall: wall.evidence, default=None) for rows in begun]
+    owners = [(k, erring) for k, starts in enumerate(begun) for _ in starts for erring in (False, True)]
+    rows = [(*start, rival) for starts, (_, _, rival) in zip(begun, pushes, strict=True) for start in starts]
+    fits = clip.crew.each(clip, _fitted, [(*row, erring) for row in rows for erring in (False, True)])
+    # Of those that begin elsewhere the best goes on: of either kind, since the impacts of one could not err yet.
+    best: dict[tuple[int, bool], Fit] = {}
+    for owner, fit in zip(owners, fits, strict=True):
+        best[owner] = max(best.get(owner, fit), fit, key=lambda wall: wall.evidence)
+    ended = clip.crew.each(clip, knocked, [(fit, pushes[k][2]) for (k, _), fit in best.items()])
+    walls: list[Fit | None] = [None] * len(pushes)
+    for (k, _), fit in zip(best, ended, strict=True):
+        kept = walls[k]
+        walls[k] = fit if kept is None or fit.evidence > kept.evidence else kept
+    return walls
 
 
 def push_last(fit: Fit) -> Fit:
@@ -78,11 +88,10 @@ def _facings(clip: ClipFit, fit: Fit, view: FitView) -> list[tuple[Hypothesis, n
     return [(hypothesis, points[k * len(moments) + int(np.argmin(costs[k]))]) for k in sorted(facing)]
 
 
-def _wall(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray, rival: float) -> Fit:
-    """The better of two: one whose impact errs from the first step on, and one whose impact does once its place is found."""
-    late = knocked(clip, clip.fit(hypothesis, z, ITERATIONS, rival=PATIENCE * rival, thorough=False), rival)
-    *others, wall = hypothesis.terms
-    wall = dataclasses.replace(wall, excused=excuses(clip, hypothesis, z, len(others)))
-    erring = dataclasses.replace(hypothesis, terms=(*others, wall))
-    early = clip.fit(erring, z, ITERATIONS, rival=PATIENCE * rival, thorough=False)
-    return max(late, knocked(clip, early, rival), key=lambda fit: fit.evidence)
+def _fitted(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray, rival: float, erring: bool) -> Fit:
+    """An obstacle's fit; ``erring``: its impact errs from the first step on, and not only once its place is found."""
+    if erring:
+        *others, wall = hypothesis.terms
+        wall = dataclasses.replace(wall, excused=excuses(clip, hypothesis, z, len(others)))
+        hypothesis = dataclasses.replace(hypothesis, terms=(*others, wall))
+    return clip.fit(hypothesis, z, ITERATIONS, rival=PATIENCE * rival, thorough=False)

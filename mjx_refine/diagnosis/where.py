@@ -7,15 +7,13 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
+from mjx_refine.diagnosis.common_motion import similar
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.noise import BACKGROUND_COUNT
 from mjx_refine.diagnosis.result import CHANNELS, Place
 from mjx_refine.effects.kind import FitView
 from mjx_refine.search.features import DIRECTIONS
 from mjx_refine.view.outline import directions
-
-FEW = 8
-"""Places of the background's flow below which no common motion is told from noise."""
 
 LOUD = 2.0
 """Mean square residual [noise widths squared] from which a frame counts as misfitting."""
@@ -45,20 +43,8 @@ def background_energy(clip: ClipFit, fit: Fit) -> Float[np.ndarray, "frames"]:
     """
     background = clip.measured.split(fit.residual).background
     seen = np.atleast_1d(np.isfinite(clip.measured.background).all(-1))
-    shared = [_shared(row[ok], clip.measured.places[ok]) for row, ok in zip(background, seen, strict=True)]
+    shared = [similar(row[ok], clip.measured.places[ok]) for row, ok in zip(background, seen, strict=True)]
     return np.append(np.array(shared) / (2 * BACKGROUND_COUNT), 0.0)
-
-
-def _shared(flow: Float[np.ndarray, "places 2"], places: Float[np.ndarray, "places 2"]) -> float:
-    """Sum of squares of the similarity that is nearest to a flow; what as many numbers of noise have of it is taken off."""
-    if len(flow) < FEW:
-        return 0.0
-    x, y = (places - places.mean(0)).T / np.ptp(places, axis=0).max()
-    one, none = np.ones(len(x)), np.zeros(len(x))
-    design = np.concatenate([np.stack([one, none, -y, x], -1), np.stack([none, one, x, y], -1)])
-    wanted = flow.T.ravel()
-    left = wanted - design @ np.linalg.lstsq(design, wanted, rcond=None)[0]
-    return max(float(wanted @ wanted - left @ left * len(wanted) / (len(wanted) - design.shape[1])), 0.0)
 
 
 def _channels(reach: np.ndarray, moved: np.ndarray) -> np.ndarray:

@@ -289,7 +289,8 @@ def test_poses_may_err_smoothly_and_more_than_their_noise_says(changes):
         ({"after": 5.0}, True),
         ({"lead": 20.0, "held_out": 0.0}, True),
         ({"lead": 20.0, "held_out": 9.0}, False),
-        ({"lead": 20.0, "held_out": 0.0, "before": 1.5}, False),
+        ({"lead": 20.0, "held_out": 0.0, "before": 1.55}, True),
+        ({"lead": 20.0, "held_out": 0.0, "before": 1.65}, False),
     ],
 )
 def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, likely):

@@ -98,7 +98,7 @@ class Clips:
 
     def misfit(self, fit: JointFit) -> float:
         """Mean square residual of the objects in noise widths."""
-        weights = np.array([clip.expected(beside=False) for clip in self.clips])
+        weights = np.array([clip.expected(without=("background",)) for clip in self.clips])
         each = np.array([clip.misfit(part) for clip, part in zip(self.clips, fit.parts, strict=True)])
         return float((weights * each).sum() / weights.sum())
 

@@ -220,9 +220,9 @@ class PosesFit(ClipFit):
         reach = np.array(rows) if rows else none
         return Parts(reach, *(np.zeros((len(reach), *part.shape)) for part in self.measured.parts[1:]))
 
-    def expected(self, beside: bool = True) -> float:
+    def expected(self, without: tuple[str, ...] = ()) -> float:
         """As ``ClipFit.expected``, with the samples' weight."""
-        return max(self.weight * super().expected(beside), 1e-9)
+        return max(self.weight * super().expected(without), 1e-9)
 
     def jacobian(self, hypothesis, z, keep=None, scale=SCALE, size=STEPS[0]):
         """As ``ClipFit.jacobian``, in one rollout, since every parameter moves something."""
