@@ -112,20 +112,27 @@ def _outside(clip: ClipFit, fit: Fit, keep: np.ndarray) -> _Energy:
 
 def _by_frame(clip: ClipFit, white: np.ndarray) -> _Energy:
     """Sum of squares of each frame's residuals over what noise alone gives."""
-    parts, measured = clip.measured.split(white), clip.measured
+    parts = clip.measured.split(white)
     still = (parts.reach**2).sum((1, 2)) + (parts.moments**2).sum((1, 2))
-    moved, common = np.zeros(len(still)), np.zeros(len(still))
+    moved = np.zeros(len(still))
     moved[:-1] = (parts.flow**2).sum((1, 2, 3)) + (parts.background**2).sum((1, 2))
-    beside = np.atleast_1d(np.isfinite(measured.background).all(-1))
-    for t in range(len(still) - 1):
-        common[t] = similar(parts.background[t, beside[t]], measured.places[beside[t]])
-        for flow, seen, pixels in zip(parts.flow[t], measured.flow[t], measured.pixels[t], strict=True):
-            on = np.isfinite(seen).all(-1)
-            common[t] += affine(flow[on], pixels[on])
     whole, outlines = (
         max(told / clip.frames, 1e-9) for told in (clip.expected(), clip.expected(("flow", "background")))
     )
-    return _Energy((still + moved) / whole, (still + common) / outlines)
+    return _Energy((still + moved) / whole, (still + in_common(clip, white)) / outlines)
+
+
+def in_common(clip: ClipFit, white: Float[np.ndarray, "residuals"]) -> Float[np.ndarray, "frames"]:
+    """Sum of squares of what residuals of flow, on each object and beside them, have in common, by frame."""
+    parts, measured = clip.measured.split(white), clip.measured
+    beside = np.atleast_1d(np.isfinite(measured.background).all(-1))
+    common = np.zeros(len(parts.reach))
+    for t, there in enumerate(beside):
+        common[t] = similar(parts.background[t, there], measured.places[there])
+        for flow, seen, pixels in zip(parts.flow[t], measured.flow[t], measured.pixels[t], strict=True):
+            on = np.isfinite(seen).all(-1)
+            common[t] += affine(flow[on], pixels[on])
+    return common
 
 
 def _rough(clip: ClipFit, fit: Fit) -> _Energy:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.heldout import BLOCK
+from mjx_refine.diagnosis.heldout import BLOCK, in_common
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.joint.counts import counts_of
 from mjx_refine.diagnosis.joint.hypothesis import with_frozen_setup
@@ -115,9 +115,10 @@ def _foretold(clip: ClipFit, fit: Fit, early: np.ndarray, seed: int) -> Foretold
     )
     variance = 1.0 + spread
     likelihood = -0.5 * float((counts * (rows[0] ** 2 / variance + np.log(variance))).sum())
-    total = max(float(counts.sum()), 1e-9)
-    floor = float(np.sqrt((counts * variance).sum() / total))
-    return Foretold(fit, _by_frame(clip, counts * rows[0] ** 2, counts)[~early], likelihood, floor)
+    outlines = _of_outlines(clip, counts)
+    floor = float(np.sqrt((outlines * variance).sum() / max(float(outlines.sum()), 1e-9)))
+    energy = _by_frame(clip, outlines * rows[0] ** 2) + in_common(clip, np.sqrt(counts) * rows[0])
+    return Foretold(fit, (energy / np.maximum(_by_frame(clip, outlines), 1e-9))[~early], likelihood, floor)
 
 
 def excused(clip: ClipFit, told: Foretold, early: np.ndarray, slackness: float) -> Foretold:
@@ -128,7 +129,7 @@ def excused(clip: ClipFit, told: Foretold, early: np.ndarray, slackness: float) 
     blur, columns = np.concatenate([w.ravel() for w in _squares(clip)]), clip.slack_columns
     clip.forget_slack(before)
     plain = np.concatenate([w.ravel() for w in _squares(clip)])
-    counts = counts_of(clip) * clip.measured.kept(~early)
+    counts = _of_outlines(clip, counts_of(clip) * clip.measured.kept(~early))
     # Columns are in widths of the blurred noise, times the root of the count.
     wide = (columns**2).sum(1) / np.maximum(counts_of(clip), 1e-12) * blur / plain + (blur - plain) / plain
     more = float((counts * np.minimum(wide, WIDE**2)).sum() / max(float(counts.sum()), 1e-9))
@@ -140,15 +141,19 @@ def _squares(clip: ClipFit) -> list[np.ndarray]:
     return [np.broadcast_to(w, part.shape) ** 2.0 for w, part in zip(clip.widths, clip.measured.parts, strict=True)]
 
 
-def _by_frame(clip: ClipFit, energy: np.ndarray, counts: np.ndarray) -> Float[np.ndarray, "frames"]:
-    """Mean square of each frame's residuals."""
-    sums = []
-    for row in (energy, counts):
-        parts = clip.measured.split(row)
-        total = parts.reach.sum((1, 2)) + parts.moments.sum((1, 2))
-        total[:-1] += parts.flow.sum((1, 2, 3)) + parts.background.sum((1, 2))
-        sums.append(total)
-    return sums[0] / np.maximum(sums[1], 1e-9)
+def _of_outlines(clip: ClipFit, counts: np.ndarray) -> Float[np.ndarray, "residuals"]:
+    """Counts of outlines and centroids (of poses: of all that there is), and none of flow, of which only what it has in common is
+    told (``in_common``)."""
+    parts = clip.measured.split(counts)
+    return np.concatenate(
+        [part.ravel() for part in parts._replace(flow=0 * parts.flow, background=0 * parts.background)]
+    )
+
+
+def _by_frame(clip: ClipFit, numbers: np.ndarray) -> Float[np.ndarray, "frames"]:
+    """Sums over each frame's outlines and centroids."""
+    parts = clip.measured.split(numbers)
+    return parts.reach.sum((1, 2)) + parts.moments.sum((1, 2))
 
 
 # --- over all judged clips ---------------------------------------------------------------------------------------------

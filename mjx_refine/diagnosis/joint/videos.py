@@ -115,7 +115,7 @@ class Videos(SetUp):
 
 
 def _result(course: Course, set_up: Videos, seed: int, began: float) -> Diagnosis:
-    gap = numbers(course, "centroids, outlines, flow, background against the clip", "clip", seed)
+    gap = numbers(course, "centroids, outlines, what flow on and beside objects has in common", "clip", seed)
     before, after = (_scores(set_up, course.judged, told) for told in (course.rated.before, course.rated.after))
     gap = dataclasses.replace(gap, iou_before=before[0], iou_after=after[0], epe_before=before[1], epe_after=after[1])
     first, parts = set_up.clips[0], [fit.parts[0] for fit in (course.base, course.shown)]
