@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from mjx_refine.cli.main import run
 from mjx_refine.diagnosis import Poses, diagnose_poses
 from mjx_refine.diagnosis.fit import prior
 from mjx_refine.diagnosis.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.joint.answer import no_better_than_one
 from mjx_refine.diagnosis.joint.arrow import Arrow
 from mjx_refine.diagnosis.joint.fit import Clips
 from mjx_refine.diagnosis.joint.heldout import Foretold, Outside, early_part, foretell, split
@@ -247,6 +249,20 @@ def test_the_gap_of_held_out_clips():
     assert not told.sure(0)  # a third of the clips loses
     assert Outside(before[:2], after[:2]).sure(0)
     assert not Outside(before[1:], after[1:]).sure(0)
+
+
+@pytest.mark.parametrize(("gain", "refuted"), [(30.0, True), (50.0, True), (51.0, False)])
+def test_a_second_effect_that_foretells_nothing_more_is_refuted(gain, refuted):
+    """However much more two effects explain of the fitted clips, of the others one alone foretells as much."""
+    before = (foretold(5.0, 0.0), foretold(9.0, 0.0))
+
+    def judged(likelihood: float) -> Outside:
+        return Outside(before, (foretold(2.0, 10.0), foretold(3.0, likelihood - 10.0)))
+
+    two, one, third = (SimpleNamespace(names=names) for names in (("wind", "shape"), ("wind",), ("drag",)))
+    outside = [(one, judged(50.0)), (third, judged(400.0)), (two, judged(gain))]
+    assert no_better_than_one(two, outside[2][1], outside) == refuted  # type: ignore[arg-type]
+    assert not no_better_than_one(one, outside[0][1], outside)  # type: ignore[arg-type]
 
 
 # --- from end to end --------------------------------------------------------------------------------------------------

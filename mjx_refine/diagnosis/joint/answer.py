@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -59,7 +60,7 @@ def said(
       least: misfit below which leads are not counted in units of it.
       seed: of the bootstrap.
     """
-    refuted = tuple(c for c, told in outside if not told.sure(seed))
+    refuted = tuple(c for c, told in outside if not told.sure(seed) or no_better_than_one(c, told, outside))
     tested = {id(c) for c, _ in outside}
 
     def standing(candidates) -> tuple[JointCandidate, ...]:
@@ -67,7 +68,8 @@ def said(
 
     kept = dataclasses.replace(compared, candidates=standing(compared.candidates), pairs=standing(compared.pairs))
     held_out = max((float(told.gains.sum()) for _, told in outside), default=0.0)
-    found = joint_signs(clips, kept, held_out, least)
+    closed = {id(c): told.closed for c, told in outside}
+    found = joint_signs(clips, kept, held_out, least, lambda one: closed[id(one)])
     told = answer(found, [c.lead for c in kept.candidates])
     if told.kind == "none" and outside[0][1].inexplicable:
         # What the fit excuses, by bending the starts, does not foretell the other clips.
@@ -80,15 +82,30 @@ def said(
     return Said(verdict, told, found, best, shown, refuted)  # type: ignore[arg-type]
 
 
-def joint_signs(clips: Clips, compared: JointCompared, held_out: float, least: float) -> Signs:
-    """As ``signs.signs``, over all fitted clips: structure is their mean."""
+def no_better_than_one(candidate: JointCandidate, told: Outside, outside: list[tuple[JointCandidate, Outside]]) -> bool:
+    """Whether one of two effects foretells the others as well by itself: then the second only bends with the fitted clips."""
+    if len(candidate.names) < 2:
+        return False
+    alone = [other.gains.sum() for c, other in outside if len(c.names) == 1 and c.names[0] in candidate.names]
+    return bool(told.gains.sum() <= max(alone, default=-np.inf))
+
+
+def joint_signs(
+    clips: Clips,
+    compared: JointCompared,
+    held_out: float,
+    least: float,
+    closed_of: Callable[[JointCandidate], float],
+) -> Signs:
+    """As ``signs.signs``, over all fitted clips: structure is their mean, and what is closed is of the others."""
     singles, pairs, base = compared.candidates, compared.pairs, compared.base
     ends = [base, *(c.fit for c in (*singles[:3], *pairs[:1]))]
     unit = max(min(clips.misfit(fit) for fit in ends), least)
     first = singles[0] if singles else None
     other = next((c for c in singles if first is not None and c.names != first.names), None)
     leading = [c for c in (*singles[:1], *pairs[:1]) if c.lead > 0]
-    after = max(leading, key=lambda c: c.lead).fit if leading else base
+    best = max(leading, key=lambda c: c.lead) if leading else None
+    after = best.fit if best else base
     lead = first.lead / unit if first else 0.0
     return Signs(
         lead=lead,
@@ -100,6 +117,7 @@ def joint_signs(clips: Clips, compared: JointCompared, held_out: float, least: f
         structure_after=_structure(clips, after),
         held_out=held_out / unit,
         whole=1.0 if lead >= NAMED / 2 else 2 * base.data / clips.expected(),
+        closed=closed_of(best) if best else 1.0,
     )
 
 
