@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import builtins
+import symtable
 from functools import cache
 from pathlib import Path
 
@@ -250,3 +252,38 @@ def test_every_public_function_says_what_it_does(path):
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_")
     ]
     assert [node.name for node in public if not ast.get_docstring(node)] == []
+
+
+# --- names ------------------------------------------------------------------------------------------------------------
+
+
+def undefined(source: str) -> set[str]:
+    """Global names that code refers to and nothing defines.
+
+    Linters cannot say so here: jaxtyping's shapes look like names to them.
+    """
+    top = symtable.symtable(source, "<source>", "exec")
+    bound = {s.get_name() for s in top.get_symbols() if s.is_assigned() or s.is_imported() or s.is_namespace()}
+    bound |= {"__file__", "__name__", "__doc__", "__path__", *dir(builtins)}
+    found: set[str] = set()
+    tables = [top]
+    while tables:
+        table = tables.pop()
+        tables += table.get_children()
+        names = [s.get_name() for s in table.get_symbols() if s.is_referenced() and (table is top or s.is_global())]
+        found |= set(names) - bound
+    return found
+
+
+@every_file
+def test_every_name_is_defined(path):
+    assert undefined(path.read_text()) == set()
+
+
+def test_names_that_nothing_defines_are_found():
+    source = (
+        "from __future__ import annotations\nimport math\nSIZE = 2\n\n"
+        'def of(x: Float[np.ndarray, "rows columns"]) -> int:\n'
+        "    def inner():\n        return x + SIZE + math.pi + len(missing) + [y for y in x]\n    return inner()\n"
+    )
+    assert undefined(source) == {"missing"}
