@@ -228,6 +228,19 @@ def test_a_perfect_simulation_at_uneven_times_leaves_nothing():
     assert found.linear_velocity == pytest.approx((3.0, 0.3, 2.5), abs=0.02)
 
 
+@pytest.mark.parametrize("every", [1, 3])
+def test_what_is_held_out_changes_nothing_of_what_is_kept(every):
+    """Samples are not frames: of one in three frames, the last that is kept lies far beyond a frame of its number."""
+    poses = recorded(THROW, 45.0, 1.2)
+    poses = make_poses(poses.time[::every], poses.position[0, ::every], poses.quaternion[0, ::every], source="sparse")
+    clip = PosesFit(MujocoSimulator(THROW.shapes, rate_of(poses.time), 1), poses, (0,))
+    hypothesis = Hypothesis(poses_space(THROW))
+    z = np.full((1, hypothesis.dimension), 0.1)
+    keep = np.arange(len(poses.time)) < 0.6 * len(poses.time)
+    white = clip.residuals(hypothesis, z)[0]
+    np.testing.assert_array_equal(clip.residuals(hypothesis, z, keep)[0], white * clip.measured.kept(keep))
+
+
 def test_what_impacts_excuse_is_told_all_the_same():
     poses = recorded(THROW, span=0.4)
     scene = started(GIVEN, poses, (0,))

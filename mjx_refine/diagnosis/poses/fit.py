@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
+from mjx_refine.diagnosis.apart import Flight
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
 from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.diagnosis.noise import Counts, Noise
@@ -223,6 +224,10 @@ class PosesFit(ClipFit):
     def expected(self, without: tuple[str, ...] = ()) -> float:
         """As ``ClipFit.expected``, with the samples' weight."""
         return max(self.weight * super().expected(without), 1e-9)
+
+    def flown(self, batch: SceneBatch, keep: np.ndarray | None = None) -> Flight:
+        """As ``ClipFit.flown``, to the end: samples are not frames, and the last one that is kept lies at any of these."""
+        return super().flown(batch)
 
     def jacobian(self, hypothesis, z, keep=None, scale=SCALE, size=STEPS[0]):
         """As ``ClipFit.jacobian``, in one rollout, since every parameter moves something."""
