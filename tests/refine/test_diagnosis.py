@@ -168,7 +168,8 @@ def changed(changes):
     [
         ({}, "single"),
         ({"lead": 20.0}, "none"),
-        ({"lead": 20.0, "before": 1.5}, "unknown"),
+        ({"lead": 20.0, "before": 1.65}, "unknown"),
+        ({"lead": 20.0, "before": 1.55}, "none"),
         ({"lead": 20.0, "structure_after": 9.0}, "unknown"),
         ({"lead": 5.0, "whole": 9.0}, "unknown"),
         ({"structure_after": 40.0, "after": 5.0}, "unknown"),
