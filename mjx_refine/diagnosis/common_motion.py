@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from mjx_refine.diagnosis.measure import Measured
+
 FEW = 8
 """Places below which no common motion is told from noise."""
 
@@ -17,6 +19,15 @@ def similar(flow: Float[np.ndarray, "places 2"], places: Float[np.ndarray, "plac
     """Sum of squares of the shift, turn and stretch nearest to a flow; what as many numbers of noise have of it is taken off."""
     x, y, one, none = _axes(places)
     return _shared(flow, [(one, none), (none, one), (-y, x), (x, y)])
+
+
+def of_background(
+    measured: Measured, background: Float[np.ndarray, "intervals places 2"]
+) -> Float[np.ndarray, "intervals"]:
+    """``similar`` of residuals of the background's flow, where it was measured."""
+    seen = np.isfinite(measured.background).all(-1)
+    told = zip(background, np.atleast_2d(seen), strict=True)
+    return np.array([similar(row[ok], measured.places[ok]) for row, ok in told])
 
 
 def affine(flow: Float[np.ndarray, "places 2"], places: Float[np.ndarray, "places 2"]) -> float:

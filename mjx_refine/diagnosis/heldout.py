@@ -12,7 +12,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mjx_refine.diagnosis.common_motion import affine, similar
+from mjx_refine.diagnosis.common_motion import affine, of_background
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 
 BLOCK = 3
@@ -81,12 +81,12 @@ def held_out(clip: ClipFit, base: Fit, other: Fit | None) -> HeldOut:
         frames = np.nonzero(~keep)[0]
     noise = _rough(clip, other or base)
     gain = 0.5 * float((first.all - second.all)[~keep].sum()) * clip.expected() / max(clip.frames, 1)
-    of_all = _closed(np.sqrt(first.all[frames]), np.sqrt(second.all[frames]), _mean(noise.all[frames]))
+    of_all = _closed(np.sqrt(first.all[frames]), np.sqrt(second.all[frames]), _root_mean(noise.all[frames]))
     before, after = np.sqrt(first.common[frames]), np.sqrt(second.common[frames])
-    return HeldOut(before, after, _mean(noise.common[frames]), gain, of_all)
+    return HeldOut(before, after, _root_mean(noise.common[frames]), gain, of_all)
 
 
-def _mean(squares: np.ndarray) -> float:
+def _root_mean(squares: np.ndarray) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
@@ -125,11 +125,9 @@ def _by_frame(clip: ClipFit, white: np.ndarray) -> _Energy:
 def in_common(clip: ClipFit, white: Float[np.ndarray, "residuals"]) -> Float[np.ndarray, "frames"]:
     """Sum of squares of what residuals of flow, on each object and beside them, have in common, by frame."""
     parts, measured = clip.measured.split(white), clip.measured
-    beside = np.atleast_1d(np.isfinite(measured.background).all(-1))
-    common = np.zeros(len(parts.reach))
-    for t, there in enumerate(beside):
-        common[t] = similar(parts.background[t, there], measured.places[there])
-        for flow, seen, pixels in zip(parts.flow[t], measured.flow[t], measured.pixels[t], strict=True):
+    common = np.append(of_background(measured, parts.background), 0.0)
+    for t, told in enumerate(zip(parts.flow, measured.flow, measured.pixels, strict=False)):
+        for flow, seen, pixels in zip(*told, strict=True):
             on = np.isfinite(seen).all(-1)
             common[t] += affine(flow[on], pixels[on])
     return common

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -37,19 +38,22 @@ def walls_from_pushes(
       lines: one a fit.
     """
     begun = clip.crew.each(clip, _facings, [(fit, view) for fit, view, _ in pushes], told, lines)
-    owners = [(k, erring) for k, starts in enumerate(begun) for _ in starts for erring in (False, True)]
-    rows = [(*start, rival) for starts, (_, _, rival) in zip(begun, pushes, strict=True) for start in starts]
-    fits = clip.crew.each(clip, _fitted, [(*row, erring) for row in rows for erring in (False, True)])
+    rows = [(k, *start, e) for k, starts in enumerate(begun) for start in starts for e in (False, True)]
+    rivals = [rival for _, _, rival in pushes]
+    fits = clip.crew.each(clip, _fitted, [(hypothesis, z, rivals[k], erring) for k, hypothesis, z, erring in rows])
     # Of those that begin elsewhere the best goes on: of either kind, since the impacts of one could not err yet.
-    best: dict[tuple[int, bool], Fit] = {}
-    for owner, fit in zip(owners, fits, strict=True):
-        best[owner] = max(best.get(owner, fit), fit, key=lambda wall: wall.evidence)
-    ended = clip.crew.each(clip, knocked, [(fit, pushes[k][2]) for (k, _), fit in best.items()])
-    walls: list[Fit | None] = [None] * len(pushes)
-    for (k, _), fit in zip(best, ended, strict=True):
-        kept = walls[k]
-        walls[k] = fit if kept is None or fit.evidence > kept.evidence else kept
-    return walls
+    best = _best_of([(k, erring) for k, _, _, erring in rows], fits)
+    ended = clip.crew.each(clip, knocked, [(fit, rivals[k]) for (k, _), fit in best.items()])
+    walls = _best_of([k for k, _ in best], ended)
+    return [walls.get(k) for k in range(len(pushes))]
+
+
+def _best_of(keys: Sequence[Any], fits: Sequence[Fit]) -> dict[Any, Fit]:
+    """The fit with the most evidence of every key."""
+    best: dict[Any, Fit] = {}
+    for key, fit in zip(keys, fits, strict=True):
+        best[key] = max(best.get(key, fit), fit, key=lambda one: one.evidence)
+    return best
 
 
 def push_last(fit: Fit) -> Fit:

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from mjx_refine.diagnosis.common_motion import similar
+from mjx_refine.diagnosis.common_motion import of_background
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.noise import BACKGROUND_COUNT
 from mjx_refine.diagnosis.result import CHANNELS, Place
@@ -41,10 +41,8 @@ def background_energy(clip: ClipFit, fit: Fit) -> Float[np.ndarray, "frames"]:
     What a camera does moves the whole picture: its residual is, in every frame, a shift, a turn and a stretch of all places
     together. What flow invents beside a moving object, in shadows and where nothing has texture, is not.
     """
-    background = clip.measured.split(fit.residual).background
-    seen = np.atleast_1d(np.isfinite(clip.measured.background).all(-1))
-    shared = [similar(row[ok], clip.measured.places[ok]) for row, ok in zip(background, seen, strict=True)]
-    return np.append(np.array(shared) / (2 * BACKGROUND_COUNT), 0.0)
+    shared = of_background(clip.measured, clip.measured.split(fit.residual).background)
+    return np.append(shared / (2 * BACKGROUND_COUNT), 0.0)
 
 
 def _channels(reach: np.ndarray, moved: np.ndarray) -> np.ndarray:
