@@ -15,7 +15,7 @@ from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.store import remembered
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Body, Scene
-from mjx_refine.search.features import flow_points, outlines
+from mjx_refine.search.features import Outlines, flow_points, outlines
 from mjx_refine.search.landing import LeastSquares
 from mjx_refine.search.schedule import stages
 from mjx_refine.space import Space
@@ -43,6 +43,9 @@ at 30 for a box."""
 
 NOTABLE = 2.0
 """Factor to a scene file's grip from which a note says so."""
+
+GIVEN = -1
+"""In place of hops: no landing."""
 
 GOOD = 2.5
 """Mean square residual below which no further start is tried."""
@@ -134,17 +137,27 @@ def _kept_base(landed: _Landed, hypothesis: Hypothesis) -> Fit:
 
 def fit_base(clip: ClipFit, space: Space, observation: Observation, masks_of: tuple[int, ...]) -> Fit:
     """The base model's fit: landed frame by frame as a refinement is, from the scene as it is given and with hops."""
-    hypothesis = Hypothesis(space)
     masks = foreground(observation)
     seen = outlines(masks)
     columns = tuple(seen.ids.index(i) if i in seen.ids else -1 for i in masks_of)
     flow = flow_points(masks, observation.flow, seen.ids)
-    fits: list[Fit] = [clip.fit(hypothesis, np.zeros(space.dimension), 10)]
-    wide = _scaled(space, 1 / TRUST)
-    for hops in (0, 2):
-        landing = LeastSquares(wide, clip.rollout, seen, columns, observation.size, flow)
-        point = landing.run(space.start, stages(observation.length), hops).point
-        fits.append(clip.fit(hypothesis, (point - space.start) / space.sigma, 12))
-        if clip.misfit(min(fits, key=lambda fit: fit.cost)) < GOOD:
-            break
+
+    def way(hops: int) -> tuple:
+        return Hypothesis(space), hops, seen, columns, flow
+
+    fits = clip.crew.each(clip, _from_start, [way(GIVEN), way(0)])
+    if not clip.misfit(min(fits, key=lambda fit: fit.cost)) < GOOD:
+        fits += clip.crew.each(clip, _from_start, [way(2)])
     return min(fits, key=lambda fit: fit.cost)
+
+
+def _from_start(
+    clip: ClipFit, hypothesis: Hypothesis, hops: int, seen: Outlines, columns: tuple[int, ...], flow
+) -> Fit:
+    """The fit from the scene as it is given, landed with so many hops unless these are ``GIVEN``."""
+    space = hypothesis.space
+    if hops == GIVEN:
+        return clip.fit(hypothesis, np.zeros(space.dimension), 10)
+    landing = LeastSquares(_scaled(space, 1 / TRUST), clip.rollout, seen, columns, clip.image, flow)
+    point = landing.run(space.start, stages(clip.frames), hops).point
+    return clip.fit(hypothesis, (point - space.start) / space.sigma, 12)

@@ -7,11 +7,13 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from jaxtyping import Float
 
 from mjx_refine.diagnosis.base import base_space, stored_base, with_grips
 from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared, in_order, lead_of
 from mjx_refine.diagnosis.exchange import alone
 from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import FIRST, FORGIVING
 from mjx_refine.diagnosis.lost import NAME as LOST
@@ -90,7 +92,7 @@ def compare(
     clip.settle_noise(base)
     clip.allow_chaos(base, seed)
     impacts = clip.allow_slack(base)
-    base = _of_own_contacts(clip, clip.fit(base.hypothesis, base.z, 10))
+    base = _of_own_contacts(clip, base)
     names = [name for name in catalogue() if name not in without]
     video = begin is None
 
@@ -191,10 +193,16 @@ def _of_own_contacts(clip: ClipFit, base: Fit) -> Fit:
     What two engines' contacts differ by bends the ordinary numbers where contacts may not err; about a path near the given
     scene's they may, and nothing has bent.
     """
-    begun = clip.fit(base.hypothesis, np.zeros(len(base.z)), FIRST, scale=FORGIVING)
-    ground = dataclasses.replace(base.hypothesis, slack=clip.slack_along(begun))
-    fits = clip.crew.each(clip, knocked, [(base,), (clip.fit(ground, begun.z, 10),)])
-    return max(fits, key=lambda fit: fit.evidence)
+    rows = [(base.hypothesis, base.z, False), (base.hypothesis, np.zeros(len(base.z)), True)]
+    return max(clip.crew.each(clip, _along_own_contacts, rows), key=lambda fit: fit.evidence)
+
+
+def _along_own_contacts(clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimension"], anew: bool) -> Fit:
+    """A fit with what may err along its own path; ``anew``: and along none to begin with."""
+    if anew:
+        begun = clip.fit(hypothesis, z, FIRST, scale=FORGIVING)
+        hypothesis, z = dataclasses.replace(hypothesis, slack=clip.slack_along(begun)), begun.z
+    return knocked(clip, clip.fit(hypothesis, z, 10))
 
 
 def _again(
