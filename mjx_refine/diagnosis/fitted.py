@@ -68,6 +68,11 @@ class Explained:
     def targets(self) -> tuple[int, ...]:
         return tuple(t.target for t in self.fit.hypothesis.terms)
 
+    @property
+    def effects(self) -> tuple[tuple[str, int], ...]:
+        """Name and target of every effect."""
+        return tuple(zip(self.names, self.targets, strict=True))
+
 
 def prior(hypothesis: Hypothesis, z: Float[np.ndarray, "*batch dimension"]) -> tuple[np.ndarray, np.ndarray]:
     """The prior as residuals, and their derivatives in z: heavy-tailed for base parameters, normal for effects'."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, in_order, lead_of, obstacle_for
+from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, in_order, lead_of, obstacle_for, rivals
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
@@ -107,7 +107,7 @@ def _differing(found: list[Candidate]) -> list[Candidate]:
     """The best of each two effects, in their order."""
     kept: dict[tuple, Candidate] = {}
     for one in found:
-        kept.setdefault(tuple(sorted(zip(one.names, one.targets, strict=True))), one)
+        kept.setdefault(tuple(sorted(one.effects)), one)
     return list(kept.values())
 
 
@@ -134,7 +134,7 @@ def _beside(clip: ClipFit, firsts: list[Candidate], names: list[str], shown: Sho
     for first in firsts:
         others = _others(first.fit, names)
         leads = Screen(clip, first.fit, shown(first.fit)).leads(others)
-        leads = [x for x in leads if (x.name, x.target) not in set(zip(first.names, first.targets, strict=True))]
+        leads = [x for x in leads if (x.name, x.target) not in first.effects]
         # So many effects, not so many moments of one push.
         yield from ((first, x) for x in chosen_of(leads, SECONDS, 1) if x.gain > SECOND_PROMISE)
 
@@ -142,7 +142,7 @@ def _beside(clip: ClipFit, firsts: list[Candidate], names: list[str], shown: Sho
 def _firsts(singles: tuple[Candidate, ...]) -> list[Candidate]:
     """Beside which second effects are looked for."""
     firsts: list[Candidate] = []
-    for one in itertools.takewhile(lambda one: one.lead >= PROMISE_OF_PAIRS, singles):
+    for one in itertools.takewhile(lambda one: one.lead >= PROMISE_OF_PAIRS, rivals(singles)):
         if len(firsts) < FIRSTS and not any(_one_cause(one, other) for other in firsts):
             firsts.append(one)
     return firsts
@@ -197,17 +197,24 @@ def _one_cause(one: Candidate, other: Candidate) -> bool:
 def _together(
     clip: ClipFit, base: Fit, singles: tuple[Candidate, ...]
 ) -> Iterator[tuple[Hypothesis, Float[np.ndarray, "dimension"], Candidate, Candidate]]:
-    """Twos of the best effects, each as it was found alone, and where their fits begin."""
-    count = base.hypothesis.dimension
-    twos = [two for two in itertools.combinations(singles[:JOINED], 2) if not _one_cause(*two) and two[1].lead > 0]
-    for one, other in twos:
-        hypothesis = one.fit.hypothesis.added(other.fit.hypothesis.terms[-1])
-        first, second = one.fit.z, other.fit.z
-        parts = [(a * first[count:], b * second[count:]) for a, b in PARTS]
-        # Not only where it costs least: from the better one's ordinary numbers fits end well that begin badly.
-        for grounds in ([first[:count]], [second[:count], first[:count] + second[:count] - base.z]):
-            points = np.array([np.concatenate([z, *two]) for z in grounds for two in parts])
-            yield hypothesis, clip.best_of(hypothesis, points), one, other
+    """Twos of the best effects, each as it was found alone, and where their fits begin; with the best one, or of its rivals."""
+    with_best = ((singles[0], other) for other in singles[1:JOINED])
+    for one, other in itertools.chain(with_best, itertools.combinations(rivals(singles)[1:JOINED], 2)):
+        if other.lead > 0 and not _one_cause(one, other):
+            yield from _starts_of_two(clip, base, one, other)
+
+
+def _starts_of_two(
+    clip: ClipFit, base: Fit, one: Candidate, other: Candidate
+) -> Iterator[tuple[Hypothesis, Float[np.ndarray, "dimension"], Candidate, Candidate]]:
+    """Where the fits of two effects begin: not only where it costs least, since from the better one's ordinary numbers fits end
+    well that begin badly."""
+    count, hypothesis = base.hypothesis.dimension, one.fit.hypothesis.added(other.fit.hypothesis.terms[-1])
+    first, second = one.fit.z, other.fit.z
+    parts = [(a * first[count:], b * second[count:]) for a, b in PARTS]
+    for grounds in ([first[:count]], [second[:count], first[:count] + second[:count] - base.z]):
+        points = np.array([np.concatenate([z, *two]) for z in grounds for two in parts])
+        yield hypothesis, clip.best_of(hypothesis, points), one, other
 
 
 def _in_place_of_pushes(
@@ -239,7 +246,7 @@ def _without_push(base: Fit, singles: tuple[Candidate, ...], one: Candidate) -> 
     """What the other of two effects costs alone, or the base model where it was not fitted alone."""
     k = one.names.index("push")
     rest = (one.names[1 - k], one.targets[1 - k])
-    return next((c.fit.cost for c in singles if (c.names[0], c.targets[0]) == rest), base.cost)
+    return next((c.fit.cost for c in singles if c.effects[0] == rest), base.cost)
 
 
 def _other(one: Candidate, name: str) -> str:

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.diagnosis.base import base_space, stored_base, with_grips
-from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared, in_order, lead_of
-from mjx_refine.diagnosis.exchange import alone
+from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared, in_order, lead_of, rivals
+from mjx_refine.diagnosis.exchange import alone, at_least_nothing
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
@@ -176,7 +176,14 @@ def _as_found_together(
     clip: ClipFit, base: Fit, singles: tuple[Candidate, ...], pairs: tuple[Candidate, ...]
 ) -> tuple[Candidate, ...]:
     """The single effects; where the best two found better ordinary numbers for one of them, with these."""
-    rows = [(pair.fit, k) for pair in pairs[:TOGETHER] if pair.lead > singles[0].lead for k in range(len(pair.names))]
+    outdone = {one.effects[0] for one in singles[len(rivals(singles)) :]}
+    rows = [
+        (pair.fit, k)
+        for pair in pairs[:TOGETHER]
+        if pair.lead > singles[0].lead
+        for k, effect in enumerate(pair.effects)
+        if effect not in outdone
+    ]
     plain = [dataclasses.replace(one, lead=lead_of(one.fit, base)) for one in singles]
     found = {(one.names, one.targets): one for one in plain}
     for fit in clip.crew.each(clip, alone, rows):
@@ -218,11 +225,14 @@ def _again(
             break
     clip.allow_chaos(best, seed)
     impacts = clip.allow_slack(best)
-    kept = [*singles[:KEPT], *twos]
-    base, *fits = clip.crew.each(clip, _refitted, [(base, 10), *((one.fit, 8) for one in kept)])
-    found = [dataclasses.replace(one, fit=fit, lead=lead_of(fit, base)) for one, fit in zip(kept, fits, strict=True)]
-    count = len(singles[:KEPT])
-    return base, in_order(clip, found[:count]), in_order(clip, found[count:]), impacts
+    kept, near = singles[:KEPT], len(rivals(singles))
+    rows = [(one.fit, 8 if k < near else 0) for k, one in enumerate(kept)] + [(two.fit, 8) for two in twos]
+    base, *fits = clip.crew.each(clip, _refitted, [(base, 10), *rows])
+    fitted = {one.effects[0]: (fit, one.promise) for one, fit in zip(kept, fits, strict=False)}
+    fitted = at_least_nothing(clip, base, fitted)
+    found = [Candidate(fit, lead_of(fit, base), promise) for fit, promise in fitted.values()]
+    again = [Candidate(fit, lead_of(fit, base), two.promise) for two, fit in zip(twos, fits[len(kept) :], strict=True)]
+    return base, in_order(clip, found), in_order(clip, again), impacts
 
 
 def thinness(singles: tuple[Candidate, ...]) -> float:
@@ -248,5 +258,6 @@ def _along_its_own(clip: ClipFit, fit: Fit) -> Fit:
 
 
 def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:
+    """The fit along its own path after so many iterations; as it stands there where these are none."""
     fit = _along_its_own(clip, fit)
-    return knocked(clip, clip.fit(fit.hypothesis, fit.z, iterations, thorough=False))
+    return knocked(clip, clip.fit(fit.hypothesis, fit.z, iterations, thorough=False)) if iterations else fit

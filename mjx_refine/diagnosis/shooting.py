@@ -70,7 +70,7 @@ def base_with_nodes(clip: ClipFit, base: Fit, theres: Sequence[Fit], seed: int) 
 def found_before(clip: ClipFit, base: Fit, before: tuple[Candidate, ...]) -> Fitted:
     """Effects that were found without nodes, with those of ``base``."""
     fits = clip.crew.each(clip, _fitted, [(with_nodes_of(one.fit, base), ITERATIONS) for one in before[:KEPT]])
-    return {(o.names[0], o.targets[0]): (fit, o.promise) for o, fit in zip(before, fits, strict=False)}
+    return {o.effects[0]: (fit, o.promise) for o, fit in zip(before, fits, strict=False)}
 
 
 def _fitted(clip: ClipFit, there: Fit, iterations: int) -> Fit:

@@ -176,7 +176,8 @@ def test_twos_with_a_push_are_tried_with_an_obstacle_and_with_a_patch_in_its_pla
     monkeypatch.setattr(pairs, "push_last", lambda fit: fit)
     monkeypatch.setattr(pairs, "walls_from_pushes", lambda *row: tried("hidden_obstacle", *row))
     monkeypatch.setattr(pairs, "patches_from_pushes", lambda *row: tried("friction_patch", *row))
-    shake = SimpleNamespace(names=("camera_shake",), targets=(-1,), lead=150.0, fit=fitted(150.0))
+    shake = candidate(150.0, ("camera_shake", -1))
+    shake.fit.cost = -150.0
     twos = [two("camera_shake", 300.0), two("friction_patch", 200.0), two("slope", 140.0)]
     names = [name for name in ("push", "hidden_obstacle", "friction_patch") if name != without]
     found = list(

@@ -214,7 +214,7 @@ def _pairs(clips: Clips, base: JointFit, singles, seen: Seen, names, told: Told)
             break
         here = first.fit
         allowed = [n for n in names if n not in first.names or catalogue()[n].targeted]
-        leads = [lead for lead in _look(clips, here, seen, allowed) if (lead.name, lead.target) != _only(first)]
+        leads = [lead for lead in _look(clips, here, seen, allowed) if (lead.name, lead.target) != first.effects[0]]
         for lead in [x for x in chosen_of(leads, 2, 1) if x.gain > SECOND_PROMISE]:
             told(f"{first.names[0]} and {lead.name}")
             one = lead.term(clips.frames)
@@ -222,7 +222,3 @@ def _pairs(clips: Clips, base: JointFit, singles, seen: Seen, names, told: Told)
             fit = clips.fit(hypothesis, _begin(clips, hypothesis, here, lead, lead.z(one)), 7)
             found.append(JointCandidate(fit, lead_of(fit, base)))
     return tuple(sorted(found, key=lambda c: -c.lead))
-
-
-def _only(candidate: JointCandidate) -> tuple[str, int]:
-    return candidate.names[0], candidate.targets[0]

@@ -1,0 +1,104 @@
+"""What is left undone where nothing leads, or one effect outdoes all others."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from test_diagnosis_candidates import candidate
+
+from mjx_refine.diagnosis import pairs, search, singles
+from mjx_refine.diagnosis.candidates import DOUBT, OUTDONE, Candidate, rivals
+
+BEST = candidate(1000.0, ("camera_shake", -1))
+NEAR = candidate(1.01 * OUTDONE * BEST.lead, ("drag", 0))
+FAR = candidate(0.99 * OUTDONE * BEST.lead, ("push", 0))
+LAST = candidate(0.5 * OUTDONE * BEST.lead, ("magnus", 0))
+
+
+def test_what_leads_by_far_less_than_the_best_is_no_rival():
+    assert rivals((BEST, NEAR, FAR, LAST)) == [BEST, NEAR]
+    assert rivals(()) == []
+    assert rivals((candidate(-3.0, ("drag", 0)),)) != []
+
+
+@pytest.mark.parametrize(
+    ("lead", "misfit", "hardly"),
+    [
+        (0.99 * singles.HARDLY, 1.0, True),
+        (1.01 * singles.HARDLY, 1.0, False),
+        (1.01 * singles.HARDLY, 1.2, True),
+        (0.0, 1.01 * singles.SETTLED, False),
+        (-5.0, 0.1, True),
+    ],
+)
+def test_little_is_gained_on_a_base_model_that_leaves_little(lead, misfit, hardly):
+    """By leads in units of the misfit left, and only where that is little."""
+    base: Any = SimpleNamespace(evidence=0.0)
+    clip: Any = SimpleNamespace(misfit=lambda fit: misfit)
+    one = candidate(lead, ("drag", 0)).fit
+    assert singles._hardly(clip, base, {("drag", 0): (one, 0.0)}) is hardly
+
+
+def test_without_any_effect_little_is_gained():
+    base: Any = SimpleNamespace(evidence=0.0)
+    clip: Any = SimpleNamespace(misfit=lambda fit: 1.0)
+    assert singles._hardly(clip, base, {})
+
+
+def test_a_patch_of_the_floor_counts_with_its_doubt():
+    base: Any = SimpleNamespace(evidence=0.0)
+    clip: Any = SimpleNamespace(misfit=lambda fit: 1.0)
+    patch = candidate(singles.HARDLY + 0.9 * DOUBT["friction_patch"], ("friction_patch", -1)).fit
+    assert singles._hardly(clip, base, {("friction_patch", -1): (patch, 0.0)})
+
+
+def test_twos_of_effects_that_the_best_outdoes_are_not_put_together(monkeypatch):
+    monkeypatch.setattr(pairs, "_one_cause", lambda one, other: False)
+    monkeypatch.setattr(pairs, "_starts_of_two", lambda clip, base, one, other: [(one.names[0], other.names[0])])
+    nothing: Any = None
+    found = [two for two in pairs._together(nothing, nothing, (BEST, NEAR, FAR, LAST))]
+    assert found == [("camera_shake", "drag"), ("camera_shake", "push"), ("camera_shake", "magnus")]
+    equal = candidate(900.0, ("wind", -1))
+    found = [two for two in pairs._together(nothing, nothing, (BEST, equal, NEAR))]
+    assert found == [("camera_shake", "wind"), ("camera_shake", "drag"), ("wind", "drag")]
+
+
+def test_nothing_is_looked_for_beside_what_the_best_outdoes(monkeypatch):
+    monkeypatch.setattr(pairs, "_one_cause", lambda one, other: False)
+    assert pairs._firsts((BEST, FAR)) == [BEST]
+    assert pairs._firsts((BEST, NEAR, FAR)) == [BEST, NEAR]
+
+
+def test_with_new_noise_only_rivals_are_fitted_again(monkeypatch):
+    """The others are told where they stand, and where that is behind the base model, at no size."""
+    asked: list[tuple[str, int]] = []
+
+    def each(clip, piece, rows):
+        asked.extend((row[0].hypothesis.terms[0].name if row[0].hypothesis.terms else "", row[1]) for row in rows)
+        return [row[0] for row in rows]
+
+    clip: Any = SimpleNamespace(
+        crew=SimpleNamespace(each=each),
+        measured=SimpleNamespace(moment_noise=1.0),
+        settle_noise=lambda fit, order: None,
+        allow_chaos=lambda fit, seed: None,
+        allow_slack=lambda fit: 0,
+    )
+    behind: list[Any] = []
+
+    def nothing(clip, base, fitted):
+        behind.extend(fitted)
+        return fitted
+
+    monkeypatch.setattr(search, "_along_its_own", lambda clip, fit: fit)
+    monkeypatch.setattr(search, "at_least_nothing", nothing)
+    monkeypatch.setattr(search, "in_order", lambda clip, found: tuple(found))
+    base: Any = SimpleNamespace(hypothesis=SimpleNamespace(terms=()), evidence=0.0)
+    two = candidate(1100.0, ("camera_shake", -1), ("drag", 0))
+    _, found, twos, _ = search._again(clip, base, (BEST, NEAR, FAR), (two,), 0)
+    assert asked == [("", 10), ("camera_shake", 8), ("drag", 8), ("push", 0), ("camera_shake", 8)]
+    assert [one.names for one in found] == [("camera_shake",), ("drag",), ("push",)]
+    assert behind == [("camera_shake", -1), ("drag", 0), ("push", 0)]
+    assert all(isinstance(one, Candidate) for one in twos)
