@@ -25,7 +25,7 @@ from mjx_refine.diagnosis.settled import Loose
 from mjx_refine.diagnosis.slack import Contacts, Impact, contacts
 from mjx_refine.diagnosis.store import fingerprint
 from mjx_refine.search.residuals import slowed
-from mjx_refine.sim.backends import Simulator
+from mjx_refine.sim.backends import Restarting
 
 VIDEO = 30.0
 """Frames a second of the clips that the constants of impacts were chosen on."""
@@ -148,7 +148,7 @@ class PosesFit(ClipFit):
       weight: as how many independent samples each counts.
     """
 
-    def __init__(self, simulator: Simulator, poses: Poses, columns: tuple[int, ...], weight: float = 1.0):
+    def __init__(self, simulator: Restarting, poses: Poses, columns: tuple[int, ...], weight: float = 1.0):
         self.weight = weight
         measured = measured_poses(poses, columns)
         self.time = poses.time - poses.time[0]
