@@ -190,12 +190,12 @@ def _rolling(rng: np.random.Generator, stage: Stage) -> Rule:
 
 
 def _dropped(rng: np.random.Generator, stage: Stage) -> Rule:
-    frame, sign = int(rng.integers(6, 22)), int(rng.choice([-1, 1]))
+    frame, sign = int(rng.integers(6, FRAMES * 11 // 15)), int(rng.choice([-1, 1]))
     return lambda s: Effect("dropped_frames", None, {"frame": frame, "count": sign * round(s)})
 
 
 def _occluder(rng: np.random.Generator, stage: Stage) -> Rule:
-    frame, side = int(rng.integers(6, 24)), int(rng.integers(4))
+    frame, side = int(rng.integers(6, FRAMES * 4 // 5)), int(rng.integers(4))
     reach = stage.base.outlines[frame, 0]
     left, right, top, bottom = -reach[8], reach[0], -reach[12], reach[4]
     before, after, depth = rng.uniform(0.2, 0.9, 3) * max(right - left, bottom - top)
@@ -275,7 +275,7 @@ def _shrinking(rng: np.random.Generator, stage: Stage) -> Rule:
 
 
 def _teleport(rng: np.random.Generator, stage: Stage) -> Rule:
-    time = float(rng.integers(100, 360)) / 480
+    time = float(rng.integers(100, 360)) / 480 * FRAMES / FPS
     velocity = _path(stage, time)[1]
     aside = np.array([-velocity[1], velocity[0], 0.0]) * rng.choice([-1, 1])
     way = aside / (np.linalg.norm(aside) + 1e-9)
