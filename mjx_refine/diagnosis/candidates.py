@@ -32,9 +32,9 @@ counts as the moment [s]: what a bounce does is the engine's choice, and seldom 
 tumbled and bounced without any effect led by 119 for one."""
 
 OUTDONE = 0.2
-"""Part of the best effect's lead below which another is no rival: with the noise taken anew it is told where it stands, and of
-twos only those with the best one are looked for with it. (Of 165 clips of seeds 12 to 34 of the withheld exams in which two
-were named one of them was the best by itself in 149.)"""
+"""Part of the best effect's lead below which another is no rival: with the noise taken anew it is given up after its first steps
+where it then costs far more, and of twos only those with the best one are looked for with it. (Of 165 clips of seeds 12 to 34 of
+the withheld exams in which two were named one of them was the best by itself in 149.)"""
 
 LEANT, AT = 0.5, 0.003
 """Part of the time at an obstacle, to this distance [m], above which it is nothing that an object hits: a wall that a body rubs

@@ -226,8 +226,10 @@ def _again(
     clip.allow_chaos(best, seed)
     impacts = clip.allow_slack(best)
     kept, near = singles[:KEPT], len(rivals(singles))
-    rows = [(one.fit, 8 if k < near else 0) for k, one in enumerate(kept)] + [(two.fit, 8) for two in twos]
-    base, *fits = clip.crew.each(clip, _refitted, [(base, 10), *rows])
+    bound = _along_its_own(clip, best).cost
+    rows = [(one.fit, 8, np.inf if k < near else bound) for k, one in enumerate(kept)]
+    rows += [(two.fit, 8, np.inf) for two in twos]
+    base, *fits = clip.crew.each(clip, _refitted, [(base, 10, np.inf), *rows])
     fitted = {one.effects[0]: (fit, one.promise) for one, fit in zip(kept, fits, strict=False)}
     fitted = at_least_nothing(clip, base, fitted)
     found = [Candidate(fit, lead_of(fit, base), promise) for fit, promise in fitted.values()]
@@ -257,7 +259,7 @@ def _along_its_own(clip: ClipFit, fit: Fit) -> Fit:
     return clip.at(dataclasses.replace(fit.hypothesis, slack=clip.slack_along(fit)), fit.z)
 
 
-def _refitted(clip: ClipFit, fit: Fit, iterations: int) -> Fit:
-    """The fit along its own path after so many iterations; as it stands there where these are none."""
+def _refitted(clip: ClipFit, fit: Fit, iterations: int, rival: float) -> Fit:
+    """The fit along its own path; given up after its first steps where it then costs far more than ``rival``."""
     fit = _along_its_own(clip, fit)
-    return knocked(clip, clip.fit(fit.hypothesis, fit.z, iterations, thorough=False)) if iterations else fit
+    return knocked(clip, clip.fit(fit.hypothesis, fit.z, iterations, rival=rival, thorough=False), rival)

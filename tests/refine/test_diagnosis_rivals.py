@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from test_diagnosis_candidates import candidate
 
@@ -71,12 +72,12 @@ def test_nothing_is_looked_for_beside_what_the_best_outdoes(monkeypatch):
     assert pairs._firsts((BEST, NEAR, FAR)) == [BEST, NEAR]
 
 
-def test_with_new_noise_only_rivals_are_fitted_again(monkeypatch):
-    """The others are told where they stand, and where that is behind the base model, at no size."""
-    asked: list[tuple[str, int]] = []
+def test_with_new_noise_what_the_best_outdoes_is_given_up_where_it_stays_behind(monkeypatch):
+    """And stands at no size where that is behind the base model."""
+    asked: list[tuple[str, float]] = []
 
     def each(clip, piece, rows):
-        asked.extend((row[0].hypothesis.terms[0].name if row[0].hypothesis.terms else "", row[1]) for row in rows)
+        asked.extend((row[0].hypothesis.terms[0].name if row[0].hypothesis.terms else "", row[2]) for row in rows)
         return [row[0] for row in rows]
 
     clip: Any = SimpleNamespace(
@@ -96,9 +97,11 @@ def test_with_new_noise_only_rivals_are_fitted_again(monkeypatch):
     monkeypatch.setattr(search, "at_least_nothing", nothing)
     monkeypatch.setattr(search, "in_order", lambda clip, found: tuple(found))
     base: Any = SimpleNamespace(hypothesis=SimpleNamespace(terms=()), evidence=0.0)
-    two = candidate(1100.0, ("camera_shake", -1), ("drag", 0))
+    BEST.fit.cost = 7.0
+    two = candidate(1001.0, ("camera_shake", -1), ("drag", 0))
     _, found, twos, _ = search._again(clip, base, (BEST, NEAR, FAR), (two,), 0)
-    assert asked == [("", 10), ("camera_shake", 8), ("drag", 8), ("push", 0), ("camera_shake", 8)]
+    own = [("", np.inf), ("camera_shake", np.inf), ("drag", np.inf), ("push", 7.0), ("camera_shake", np.inf)]
+    assert asked == own
     assert [one.names for one in found] == [("camera_shake",), ("drag",), ("push",)]
     assert behind == [("camera_shake", -1), ("drag", 0), ("push", 0)]
     assert all(isinstance(one, Candidate) for one in twos)
