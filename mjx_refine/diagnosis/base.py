@@ -44,9 +44,6 @@ at 30 for a box."""
 NOTABLE = 2.0
 """Factor to a scene file's grip from which a note says so."""
 
-GIVEN = -1
-"""In place of hops: no landing."""
-
 GOOD = 2.5
 """Mean square residual below which no further start is tried."""
 
@@ -137,26 +134,22 @@ def _kept_base(landed: _Landed, hypothesis: Hypothesis) -> Fit:
 
 def fit_base(clip: ClipFit, space: Space, observation: Observation, masks_of: tuple[int, ...]) -> Fit:
     """The base model's fit: landed frame by frame as a refinement is, from the scene as it is given and with hops."""
-    masks = foreground(observation)
+    hypothesis, masks = Hypothesis(space), foreground(observation)
     seen = outlines(masks)
     columns = tuple(seen.ids.index(i) if i in seen.ids else -1 for i in masks_of)
-    flow = flow_points(masks, observation.flow, seen.ids)
-
-    def way(hops: int) -> tuple:
-        return Hypothesis(space), hops, seen, columns, flow
-
-    fits = clip.crew.each(clip, _from_start, [way(GIVEN), way(0)])
+    told = seen, columns, flow_points(masks, observation.flow, seen.ids)
+    fits = clip.crew.each(clip, _from_start, [(hypothesis, hops, *told) for hops in (None, 0)])
     if not clip.misfit(min(fits, key=lambda fit: fit.cost)) < GOOD:
-        fits += clip.crew.each(clip, _from_start, [way(2)])
+        fits.append(_from_start(clip, hypothesis, 2, *told))
     return min(fits, key=lambda fit: fit.cost)
 
 
 def _from_start(
-    clip: ClipFit, hypothesis: Hypothesis, hops: int, seen: Outlines, columns: tuple[int, ...], flow
+    clip: ClipFit, hypothesis: Hypothesis, hops: int | None, seen: Outlines, columns: tuple[int, ...], flow
 ) -> Fit:
-    """The fit from the scene as it is given, landed with so many hops unless these are ``GIVEN``."""
+    """The fit from the scene as it is given, landed with so many hops, or not at all."""
     space = hypothesis.space
-    if hops == GIVEN:
+    if hops is None:
         return clip.fit(hypothesis, np.zeros(space.dimension), 10)
     landing = LeastSquares(_scaled(space, 1 / TRUST), clip.rollout, seen, columns, clip.image, flow)
     point = landing.run(space.start, stages(clip.frames), hops).point

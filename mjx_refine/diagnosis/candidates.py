@@ -123,6 +123,11 @@ def lead_of(fit: Weighed, base: Weighed) -> float:
     return fit.evidence - base.evidence - sum(DOUBT.get(t.name, 0.0) for t in fit.hypothesis.terms)
 
 
+def unit_of(clip: ClipFit, fit: Fit) -> float:
+    """What leads are told in units of: the misfit that a fit leaves."""
+    return max(clip.misfit(fit), LEAST_UNIT)
+
+
 def rivals(singles: Sequence[Candidate]) -> list[Candidate]:
     """The best of single effects in their order, and those that it does not outdo by far."""
     return [one for one in singles if one is singles[0] or one.lead >= OUTDONE * singles[0].lead]
@@ -134,7 +139,7 @@ def in_order(clip: ClipFit, found: Sequence[Candidate]) -> tuple[Candidate, ...]
     found = [one for one in found if not leans_on(clip, one.fit)]
 
     def told(one: Candidate) -> Candidate:
-        unit = max(clip.misfit(one.fit), LEAST_UNIT)
+        unit = unit_of(clip, one.fit)
         price = AT_IMPACT * unit if _bounces(clip, one.fit) else 0.0
         if any(obstacle_for(one, other) and one.lead < other.lead + AGAINST * unit for other in found):
             price += AGAINST * unit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared
+from mjx_refine.diagnosis.candidates import Candidate, Compared, unit_of
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.heldout import HeldOut, held_out
 from mjx_refine.diagnosis.signs import MOSTLY, Signs, best_candidate, signs
@@ -54,7 +54,7 @@ def judged(clip: ClipFit, compared: Compared, shown: Shown, told: Told) -> Judge
     outside = outside_of(best.fit if best else None)
     seen = shown(compared.base)
     aloft = (seen.on_floor.mean(0) < MOSTLY).any()
-    if aloft or (best is not None and best.lead > NAMED * max(clip.misfit(best.fit), LEAST_UNIT)):
+    if aloft or (best is not None and best.lead > NAMED * unit_of(clip, best.fit)):
         told("a force without a name")
         freed = freely_forced(clip, compared, best.fit if best else compared.base, seen, shown)
         compared = dataclasses.replace(compared, freed=freed)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, in_order, lead_of, obstacle_for, rivals
+from mjx_refine.diagnosis.candidates import Candidate, in_order, lead_of, obstacle_for, rivals, unit_of
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
@@ -78,7 +78,7 @@ def pairs_of(
     """
     firsts = _firsts(singles)
     beside = list(_beside(clip, firsts[:1], names, shown))
-    unit = max(clip.misfit(firsts[0].fit), LEAST_UNIT) if firsts else 1.0
+    unit = unit_of(clip, firsts[0].fit) if firsts else 1.0
     if not any(lead.gain > HOPE * unit for _, lead in beside) and not any(two.lead > singles[0].lead for two in early):
         return in_order(clip, early)
     beside += _beside(clip, firsts[1:], names, shown)
@@ -244,8 +244,7 @@ def _in_place_of_pushes(
 
 def _without_push(base: Fit, singles: tuple[Candidate, ...], one: Candidate) -> float:
     """What the other of two effects costs alone, or the base model where it was not fitted alone."""
-    k = one.names.index("push")
-    rest = (one.names[1 - k], one.targets[1 - k])
+    rest = one.effects[1 - one.names.index("push")]
     return next((c.fit.cost for c in singles if c.effects[0] == rest), base.cost)
 
 

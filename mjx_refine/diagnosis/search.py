@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine.diagnosis.base import base_space, stored_base, with_grips
-from mjx_refine.diagnosis.candidates import LEAST_UNIT, Candidate, Compared, in_order, lead_of, rivals
+from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_of, rivals, unit_of
 from mjx_refine.diagnosis.exchange import alone, at_least_nothing
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
@@ -119,7 +119,7 @@ def compare(
         base, singles, twos, impacts = _again(clip, base, singles, twos, seed)
     pairs = pairs_of(clip, base, singles, twos, names, shown, seed, told)
     singles = _as_found_together(clip, base, singles, pairs)
-    if video and singles and singles[0].lead > WORTH * max(clip.misfit(singles[0].fit), LEAST_UNIT):
+    if video and singles and singles[0].lead > WORTH * unit_of(clip, singles[0].fit):
         told("from other places")
         bound = singles[0].lead - max(CLOSE, SOME_OF_IT * singles[0].lead)
         base, singles, pairs = fairly(clip, base, singles, pairs, bound, seed)

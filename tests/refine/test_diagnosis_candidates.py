@@ -164,8 +164,8 @@ def test_twos_with_a_push_are_tried_with_an_obstacle_and_with_a_patch_in_its_pla
     def fitted(evidence: float) -> SimpleNamespace:
         return SimpleNamespace(evidence=evidence, cost=-evidence, hypothesis=SimpleNamespace(terms=()))
 
-    def two(other: str, lead: float) -> SimpleNamespace:
-        return SimpleNamespace(names=(other, "push"), targets=(-1, 0), lead=lead, fit=fitted(lead))
+    def two(other: str, lead: float) -> Candidate:
+        return candidate(lead, (other, -1), ("push", 0))
 
     asked: dict[str, list[float]] = {}
 

@@ -30,7 +30,7 @@ def test_what_leads_by_far_less_than_the_best_is_no_rival():
         (0.99 * singles.HARDLY, 1.0, True),
         (1.01 * singles.HARDLY, 1.0, False),
         (1.01 * singles.HARDLY, 1.2, True),
-        (0.0, 1.01 * singles.SETTLED, False),
+        (0.0, 1.01 * singles.LEFT, False),
         (-5.0, 0.1, True),
     ],
 )
