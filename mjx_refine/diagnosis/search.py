@@ -119,12 +119,21 @@ def compare(
         base, singles, twos, impacts = _again(clip, base, singles, twos, seed)
     pairs = pairs_of(clip, base, singles, twos, names, shown, seed, told)
     singles = _as_found_together(clip, base, singles, pairs)
-    if video and singles and singles[0].lead > WORTH * unit_of(clip, singles[0].fit):
-        told("from other places")
-        bound = singles[0].lead - max(CLOSE, SOME_OF_IT * singles[0].lead)
-        base, singles, pairs = fairly(clip, base, singles, pairs, bound, seed)
-        singles = _as_found_together(clip, base, singles, pairs)
+    if video:
+        base, singles, pairs = _from_other_places(clip, base, singles, pairs, seed, told)
     return Compared(base, singles, pairs, impacts)
+
+
+def _from_other_places(
+    clip: ClipFit, base: Fit, singles: tuple[Candidate, ...], pairs: tuple[Candidate, ...], seed: int, told: Told
+) -> tuple[Fit, tuple[Candidate, ...], tuple[Candidate, ...]]:
+    """The hypotheses once what leads, and the base model, have begun from other places as well."""
+    if not singles or singles[0].lead <= WORTH * unit_of(clip, singles[0].fit):
+        return base, singles, pairs
+    told("from other places")
+    bound = singles[0].lead - max(CLOSE, SOME_OF_IT * singles[0].lead)
+    base, singles, pairs = fairly(clip, base, singles, pairs, bound, seed)
+    return base, _as_found_together(clip, base, singles, pairs), pairs
 
 
 def _shot(
@@ -153,14 +162,33 @@ def _shot(
     if not theres:
         return None
     told("from impact to impact")
-    base = base_with_nodes(clip, base, theres, seed)
+    plain, base = base, base_with_nodes(clip, base, theres, seed)
     base, singles, _ = singles_of(clip, base, names, scene, shown, seed, told, True, found_before(clip, base, before))
     impacts = sum(len(n.struck) for n in base.hypothesis.nodes)
     if singles and singles[0].lead > CLEAR:
         told("noise, once more")
         base, singles, _, impacts = _again(clip, base, singles, (), seed)
     pairs = pairs_of(clip, base, singles, (), names, shown, seed, told)
-    return Compared(base, _as_found_together(clip, base, singles, pairs), pairs, impacts)
+    singles = _as_found_together(clip, base, singles, pairs)
+    base, singles, pairs = _from_other_places(clip, base, singles, pairs, seed, told)
+    return Compared(*_against_both(clip, base, plain, singles, pairs), impacts)
+
+
+def _against_both(
+    clip: ClipFit, base: Fit, plain: Fit, singles: tuple[Candidate, ...], pairs: tuple[Candidate, ...]
+) -> tuple[Fit, tuple[Candidate, ...], tuple[Candidate, ...]]:
+    """The hypotheses by how far they lead the better of two fits of the base model, with states after impacts and without: what
+    leads must not do so since the former were made along a path that is far off without an effect."""
+    if not singles or singles[0].lead <= CLEAR:
+        return base, singles, pairs
+    plain = _refitted(clip, plain, 10, np.inf)
+    if plain.evidence <= base.evidence:
+        return base, singles, pairs
+
+    def led(kept: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
+        return in_order(clip, [dataclasses.replace(one, lead=lead_of(one.fit, plain)) for one in kept])
+
+    return plain, led(singles), led(pairs)
 
 
 def _explained(clip: ClipFit, compared: Compared) -> bool:

@@ -239,6 +239,7 @@ def test_two_effects_are_looked_for_where_a_second_promises_something_beside_the
         raise StopIteration
 
     clip: Any = SimpleNamespace(misfit=lambda fit: MISFIT, crew=SimpleNamespace(each=each))
+    monkeypatch.setattr(pairs, "_only_noise", lambda clip, fit: False)
     monkeypatch.setattr(pairs, "_beside", beside)
     twos = () if early is None else (candidate(early, ("shape", 0), ("drag", 0)),)
     try:

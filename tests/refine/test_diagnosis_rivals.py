@@ -105,3 +105,40 @@ def test_with_new_noise_what_the_best_outdoes_is_given_up_where_it_stays_behind(
     assert [one.names for one in found] == [("camera_shake",), ("drag",), ("push",)]
     assert behind == [("camera_shake", -1), ("drag", 0), ("push", 0)]
     assert all(isinstance(one, Candidate) for one in twos)
+
+
+@pytest.mark.parametrize(
+    ("misfit", "smooth", "unsteady", "noise"),
+    [(0.9, 0.6, 0.1, True), (1.1, 0.6, 0.1, False), (0.9, 0.8, 0.1, False), (0.9, 0.6, 0.7, False)],
+)
+def test_beside_what_leaves_only_noise_no_second_effect_is_looked_for(monkeypatch, misfit, smooth, unsteady, noise):
+    """Unless two that were found before lead it."""
+    monkeypatch.setattr(pairs, "structure", lambda clip, fit: smooth)
+    monkeypatch.setattr(pairs, "unsteadiness", lambda clip, fit: unsteady)
+    monkeypatch.setattr(pairs, "in_order", lambda clip, found: tuple(found))
+    looked: list[Any] = []
+    monkeypatch.setattr(pairs, "_beside", lambda clip, firsts, *rest: looked.extend(firsts) or [])
+    clip: Any = SimpleNamespace(misfit=lambda fit: misfit)
+    nothing: Any = None
+    behind, ahead = (candidate(lead, ("camera_shake", -1), ("drag", 0)) for lead in (BEST.lead - 1, BEST.lead + 1))
+    assert pairs.pairs_of(clip, nothing, (BEST,), (behind,), [], nothing, 0, nothing) == (behind,)
+    assert looked == ([] if noise else [BEST])
+    looked.clear()
+    with pytest.raises(AttributeError):  # it goes on to fit them
+        pairs.pairs_of(clip, nothing, (BEST,), (ahead,), [], nothing, 0, nothing)
+    assert looked == [BEST]
+
+
+@pytest.mark.parametrize(("without", "kept"), [(-60.0, "plain"), (-200.0, "nodes")])
+def test_what_leads_is_held_against_the_base_model_without_states_after_impacts_too(monkeypatch, without, kept):
+    monkeypatch.setattr(search, "in_order", lambda clip, found: tuple(found))
+    monkeypatch.setattr(search, "_refitted", lambda clip, fit, iterations, rival: fit)
+    nodes, plain = (SimpleNamespace(evidence=evidence) for evidence in (-150.0, without))
+    one = candidate(search.CLEAR + 10.0, ("drag", 0))
+    clip: Any = None
+    base, singles, pairs = search._against_both(clip, nodes, plain, (one,), ())  # type: ignore[arg-type]
+    assert base is (plain if kept == "plain" else nodes)
+    assert singles[0].lead == pytest.approx(one.fit.evidence + 60.0 if kept == "plain" else one.lead)
+    assert pairs == ()
+    little = candidate(0.9 * search.CLEAR, ("drag", 0))
+    assert search._against_both(clip, nodes, plain, (little,), ())[0] is nodes  # type: ignore[arg-type]
