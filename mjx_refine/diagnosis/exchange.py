@@ -7,9 +7,11 @@ begin again from what the best of the others found for the parameters that they 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
+from mjx_refine.diagnosis.candidates import Candidate, in_order, lead_of
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.knock import knocked
 
@@ -71,10 +73,15 @@ def at_least_nothing(clip: ClipFit, base: Fit, fitted: Fitted) -> Fitted:
 
 
 def _of_nothing(clip: ClipFit, base: Fit, fit: Fit) -> Fit:
-    nothing = np.zeros(len(fit.z) - len(base.z))
-    hypothesis = dataclasses.replace(fit.hypothesis, slack=base.hypothesis.slack)
-    there = clip.at(hypothesis, np.concatenate([base.z, nothing]))
+    hypothesis = dataclasses.replace(base.hypothesis, terms=fit.hypothesis.terms)
+    there = clip.at(hypothesis, np.concatenate([base.z, np.zeros(hypothesis.dimension - len(base.z))]))
     return there if there.evidence > fit.evidence else fit
+
+
+def held_against(clip: ClipFit, base: Fit, kept: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """Candidates by how far they lead ``base``, at no size where they end behind it."""
+    ends = at_least_nothing(clip, base, {("", k): (one.fit, one.promise) for k, one in enumerate(kept)})
+    return in_order(clip, [Candidate(fit, lead_of(fit, base), promise) for fit, promise in ends.values()])
 
 
 def alone(clip: ClipFit, fit: Fit, k: int) -> Fit:

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from mjx_refine.diagnosis.candidates import Candidate, in_order, lead_of
-from mjx_refine.diagnosis.exchange import at_least_nothing, begun_again
+from mjx_refine.diagnosis.candidates import Candidate
+from mjx_refine.diagnosis.exchange import begun_again, held_against
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.knock import to_the_end
 from mjx_refine.diagnosis.tempered import COOLER, WARM, cooled, tempered
@@ -93,9 +93,7 @@ def fairly(
     better = {id(one): fit for one, fit in zip(first, fits, strict=True)}
 
     def moved(kept: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
-        rows = enumerate(dataclasses.replace(one, fit=better.get(id(one), one.fit)) for one in kept)
-        ends = at_least_nothing(clip, base, {("", k): (one.fit, one.promise) for k, one in rows})
-        return in_order(clip, [Candidate(fit, lead_of(fit, base), promise) for fit, promise in ends.values()])
+        return held_against(clip, base, [dataclasses.replace(one, fit=better.get(id(one), one.fit)) for one in kept])
 
     return base, moved(singles), moved(pairs)
 

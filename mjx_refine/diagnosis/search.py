@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from mjx_refine.diagnosis.base import base_space, stored_base, with_grips
 from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_of, rivals, unit_of
-from mjx_refine.diagnosis.exchange import alone, at_least_nothing
+from mjx_refine.diagnosis.exchange import alone, at_least_nothing, held_against
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
@@ -184,11 +184,7 @@ def _against_both(
     plain = _refitted(clip, plain, 10, np.inf)
     if plain.evidence <= base.evidence:
         return base, singles, pairs
-
-    def led(kept: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
-        return in_order(clip, [dataclasses.replace(one, lead=lead_of(one.fit, plain)) for one in kept])
-
-    return plain, led(singles), led(pairs)
+    return plain, held_against(clip, plain, singles), held_against(clip, plain, pairs)
 
 
 def _explained(clip: ClipFit, compared: Compared) -> bool:

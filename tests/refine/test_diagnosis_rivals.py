@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_diagnosis_candidates import candidate
 
-from mjx_refine.diagnosis import pairs, search, singles
+from mjx_refine.diagnosis import exchange, pairs, search, singles
 from mjx_refine.diagnosis.candidates import DOUBT, OUTDONE, Candidate, rivals
 
 BEST = candidate(1000.0, ("camera_shake", -1))
@@ -131,7 +131,8 @@ def test_beside_what_leaves_only_noise_no_second_effect_is_looked_for(monkeypatc
 
 @pytest.mark.parametrize(("without", "kept"), [(-60.0, "plain"), (-200.0, "nodes")])
 def test_what_leads_is_held_against_the_base_model_without_states_after_impacts_too(monkeypatch, without, kept):
-    monkeypatch.setattr(search, "in_order", lambda clip, found: tuple(found))
+    monkeypatch.setattr(exchange, "in_order", lambda clip, found: tuple(found))
+    monkeypatch.setattr(exchange, "at_least_nothing", lambda clip, base, fitted: fitted)
     monkeypatch.setattr(search, "_refitted", lambda clip, fit, iterations, rival: fit)
     nodes, plain = (SimpleNamespace(evidence=evidence) for evidence in (-150.0, without))
     one = candidate(search.CLEAR + 10.0, ("drag", 0))
