@@ -182,16 +182,20 @@ def test_chaos_is_believed_as_far_as_the_fit_leaves_something():
 
 @dataclasses.dataclass(frozen=True)
 class _Bowl:
-    """Stands in for a hypothesis of a bowl around ``bottom``."""
+    """Stands in for a hypothesis of a bowl around ``bottom`` and, of effects with a number each, ``terms``."""
 
     bottom: tuple[float, ...]
-    terms: tuple = ()
+    terms: tuple[float, ...] = ()
     slack: None = None
     excused: None = None
 
     @property
+    def whole(self) -> tuple[float, ...]:
+        return self.bottom + self.terms
+
+    @property
     def dimension(self) -> int:
-        return len(self.bottom)
+        return len(self.whole)
 
 
 class _Stuck:
@@ -201,7 +205,7 @@ class _Stuck:
     crew = Crew()
 
     def residuals(self, hypothesis, points):
-        return None, ((points - np.array(hypothesis.bottom)) ** 2).sum(1) + 1.0
+        return None, ((points - np.array(hypothesis.whole)) ** 2).sum(1) + 1.0
 
     def slack_along(self, fit):
         return None
@@ -230,15 +234,23 @@ def test_effects_that_ended_behind_the_base_model_stand_at_no_size():
     clip = _Stuck()
     clip.at = lambda hypothesis, z: clip.fit(hypothesis, z, 0)  # type: ignore[attr-defined]
     base = clip.fit(_Bowl((0.0, 0.0)), np.array([0.5, 0.0]), 0)
-    ahead = clip.fit(_Bowl((0.0, 0.0, 1.0)), np.array([0.1, 0.0, 1.0]), 0)
-    behind = clip.fit(_Bowl((0.0, 0.0, 0.0)), np.array([2.0, 2.0, 0.5]), 0)
-    placed = clip.fit(_Bowl((0.0, 0.0, 9.0)), np.array([0.0, 0.0, 8.0]), 0)  # of which size nothing is another place
-    fitted = {("ahead", -1): (ahead, 1.0), ("behind", -1): (behind, 2.0), ("placed", 0): (placed, 3.0)}
+    ahead = clip.fit(_Bowl((0.0, 0.0), (1.0,)), np.array([0.1, 0.0, 1.0]), 0)
+    behind = clip.fit(_Bowl((0.0, 0.0), (0.0,)), np.array([2.0, 2.0, 0.5]), 0)
+    placed = clip.fit(_Bowl((0.0, 0.0), (9.0,)), np.array([0.0, 0.0, 8.0]), 0)  # of which size nothing is another place
+    # A base model's numbers may be fewer, as without states after impacts.
+    longer = clip.fit(_Bowl((0.0, 0.0, 0.0, 0.0), (0.0,)), np.array([2.0, 2.0, 1.0, 1.0, 0.5]), 0)
+    fitted = {
+        ("ahead", -1): (ahead, 1.0),
+        ("behind", -1): (behind, 2.0),
+        ("placed", 0): (placed, 3.0),
+        ("longer", 0): (longer, 4.0),
+    }
     told = at_least_nothing(clip, base, fitted)  # type: ignore[arg-type]
     assert told[("ahead", -1)][0] is ahead
     assert np.allclose(told[("behind", -1)][0].z, [0.5, 0.0, 0.0])
     assert told[("behind", -1)][1] == 2.0
     assert told[("placed", 0)][0] is placed
+    assert np.allclose(told[("longer", 0)][0].z, [0.5, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(("likeness", "told"), [(0.99, 1), (0.5, 0)])
