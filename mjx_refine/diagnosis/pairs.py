@@ -19,6 +19,7 @@ from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.diagnosis.signs import structure, unsteadiness
 from mjx_refine.diagnosis.tempered import Shown, Told, beside_tempered, cooled
+from mjx_refine.diagnosis.verdict import STILL
 from mjx_refine.diagnosis.walls import push_last, walls_from_pushes
 from mjx_refine.effects import catalogue
 
@@ -35,10 +36,10 @@ that were found with more noise leads it. In 19 clips with effects of seeds 28 t
 promised (evidence, not in such units) 172 at least where two were named, 8 to 67 where two act and were not, and 22 at most where
 one acts."""
 
-CLEAN, ROUGH, STEADY = 1.0, 0.7, 0.6
-"""Mean square residual of the best effect, how smooth in time it is (``signs.structure``), and how unsteady the background, below
-all of which no second effect is looked for, since noise is all that is left. Of 124 clips of seeds 12 to 34 of the withheld exams
-in which two were named rightly the best one's residual by itself was less smooth than that in 11, in most of which the camera
+CLEAN, ROUGH = 1.0, 0.7
+"""Mean square residual of the best effect, and how smooth in time it is (``signs.structure``), below both of which no second
+effect is looked for where the background is still, since noise is all that is left. Of 124 clips of seeds 12 to 34 of the withheld
+exams in which two were named rightly the best one's residual by itself was less smooth than that in 11, in most of which the camera
 moves; so it was in 378 of 751 in which one was named."""
 
 JOINED, LOOK, TOGETHER = 4, 4, 6
@@ -84,11 +85,12 @@ def pairs_of(
       told: called with a line for each step.
     """
     firsts = _firsts(singles)
-    if not any(two.lead > singles[0].lead for two in early) and firsts and _only_noise(clip, firsts[0].fit):
+    ahead = any(two.lead > singles[0].lead for two in early)
+    if not ahead and firsts and _only_noise(clip, firsts[0].fit):
         return in_order(clip, early)
     beside = list(_beside(clip, firsts[:1], names, shown))
     unit = unit_of(clip, firsts[0].fit) if firsts else 1.0
-    if not any(lead.gain > HOPE * unit for _, lead in beside) and not any(two.lead > singles[0].lead for two in early):
+    if not ahead and not any(lead.gain > HOPE * unit for _, lead in beside):
         return in_order(clip, early)
     beside += _beside(clip, firsts[1:], names, shown)
     lines = [f"{first.names[0]} and {lead.name}" for first, lead in beside]
@@ -114,7 +116,7 @@ def pairs_of(
 
 def _only_noise(clip: ClipFit, fit: Fit) -> bool:
     """Whether a fit leaves nothing that a second effect could explain."""
-    return clip.misfit(fit) < CLEAN and structure(clip, fit) < ROUGH and unsteadiness(clip, fit) < STEADY
+    return clip.misfit(fit) < CLEAN and structure(clip, fit) < ROUGH and unsteadiness(clip, fit) < STILL
 
 
 def _differing(found: list[Candidate]) -> list[Candidate]:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from mjx_refine.diagnosis.base import base_space, stored_base, with_grips
 from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_of, rivals, unit_of
-from mjx_refine.diagnosis.exchange import alone, at_least_nothing, held_against
+from mjx_refine.diagnosis.exchange import alone, held_against
 from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
@@ -120,11 +120,11 @@ def compare(
     pairs = pairs_of(clip, base, singles, twos, names, shown, seed, told)
     singles = _as_found_together(clip, base, singles, pairs)
     if video:
-        base, singles, pairs = _from_other_places(clip, base, singles, pairs, seed, told)
+        base, singles, pairs = _begun_elsewhere(clip, base, singles, pairs, seed, told)
     return Compared(base, singles, pairs, impacts)
 
 
-def _from_other_places(
+def _begun_elsewhere(
     clip: ClipFit, base: Fit, singles: tuple[Candidate, ...], pairs: tuple[Candidate, ...], seed: int, told: Told
 ) -> tuple[Fit, tuple[Candidate, ...], tuple[Candidate, ...]]:
     """The hypotheses once what leads, and the base model, have begun from other places as well."""
@@ -170,7 +170,7 @@ def _shot(
         base, singles, _, impacts = _again(clip, base, singles, (), seed)
     pairs = pairs_of(clip, base, singles, (), names, shown, seed, told)
     singles = _as_found_together(clip, base, singles, pairs)
-    base, singles, pairs = _from_other_places(clip, base, singles, pairs, seed, told)
+    base, singles, pairs = _begun_elsewhere(clip, base, singles, pairs, seed, told)
     return Compared(*_against_both(clip, base, plain, singles, pairs), impacts)
 
 
@@ -254,11 +254,9 @@ def _again(
     rows = [(one.fit, 8, np.inf if k < near else bound) for k, one in enumerate(kept)]
     rows += [(two.fit, 8, np.inf) for two in twos]
     base, *fits = clip.crew.each(clip, _refitted, [(base, 10, np.inf), *rows])
-    fitted = {one.effects[0]: (fit, one.promise) for one, fit in zip(kept, fits, strict=False)}
-    fitted = at_least_nothing(clip, base, fitted)
-    found = [Candidate(fit, lead_of(fit, base), promise) for fit, promise in fitted.values()]
+    found = held_against(clip, base, [dataclasses.replace(one, fit=fit) for one, fit in zip(kept, fits, strict=False)])
     again = [Candidate(fit, lead_of(fit, base), two.promise) for two, fit in zip(twos, fits[len(kept) :], strict=True)]
-    return base, in_order(clip, found), in_order(clip, again), impacts
+    return base, found, in_order(clip, again), impacts
 
 
 def thinness(singles: tuple[Candidate, ...]) -> float:

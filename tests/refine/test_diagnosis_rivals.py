@@ -90,12 +90,13 @@ def test_with_new_noise_what_the_best_outdoes_is_given_up_where_it_stays_behind(
     behind: list[Any] = []
 
     def nothing(clip, base, fitted):
-        behind.extend(fitted)
+        behind.extend(fit for fit, _ in fitted.values())
         return fitted
 
     monkeypatch.setattr(search, "_along_its_own", lambda clip, fit: fit)
-    monkeypatch.setattr(search, "at_least_nothing", nothing)
-    monkeypatch.setattr(search, "in_order", lambda clip, found: tuple(found))
+    monkeypatch.setattr(exchange, "at_least_nothing", nothing)
+    for module in (exchange, search):
+        monkeypatch.setattr(module, "in_order", lambda clip, found: tuple(found))
     base: Any = SimpleNamespace(hypothesis=SimpleNamespace(terms=()), evidence=0.0)
     BEST.fit.cost = 7.0
     two = candidate(1001.0, ("camera_shake", -1), ("drag", 0))
@@ -103,7 +104,7 @@ def test_with_new_noise_what_the_best_outdoes_is_given_up_where_it_stays_behind(
     own = [("", np.inf), ("camera_shake", np.inf), ("drag", np.inf), ("push", 7.0), ("camera_shake", np.inf)]
     assert asked == own
     assert [one.names for one in found] == [("camera_shake",), ("drag",), ("push",)]
-    assert behind == [("camera_shake", -1), ("drag", 0), ("push", 0)]
+    assert behind == [BEST.fit, NEAR.fit, FAR.fit]
     assert all(isinstance(one, Candidate) for one in twos)
 
 
