@@ -38,9 +38,9 @@ one acts."""
 
 CLEAN, ROUGH = 1.0, 0.7
 """Mean square residual of the best effect, and how smooth in time it is (``signs.structure``), below both of which no second
-effect is looked for where the background is still, since noise is all that is left. Of 124 clips of seeds 12 to 34 of the withheld
-exams in which two were named rightly the best one's residual by itself was less smooth than that in 11, in most of which the camera
-moves; so it was in 378 of 751 in which one was named."""
+effect is looked for where the background is still, since noise is all that is left. Of 124 clips of seeds 12 to 34 of the
+withheld exams in which two were named rightly the best one's residual by itself was less smooth than that in 11, in most of
+which the camera moves; so it was in 378 of 751 in which one was named."""
 
 JOINED, LOOK, TOGETHER = 4, 4, 6
 """Of how many of the best effects twos are put together, after how many steps their fits are compared, how many of these go on:
