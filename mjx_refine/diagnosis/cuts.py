@@ -21,6 +21,10 @@ DEEP = 3
 """How far nothing at all must be seen beyond the line [px]."""
 
 
+MOST_OF = 0.8
+"""Part of the border beyond which that must be so."""
+
+
 class Box(NamedTuple):
     """A rectangle [px]."""
 
@@ -73,9 +77,11 @@ def _hiding(masks: Int[np.ndarray, "frames height width"], i: int, axis: int, up
     if told is None:
         return None
     frames, row, low, high, extent = told
-    top, low, high = _grown(np.asarray(turned.max(0) == 0), row, low, high, extent)
-    if row - top < DEEP:
+    empty = np.asarray(turned.max(0) == 0)
+    span = _unseen(empty, row, low, high)
+    if span is None:
         return None
+    top, low, high = _grown(empty, row, *span, extent)
     height = turned.shape[1]
     first, last = (height - row, height - top) if upwards else (top, row)
     box = (low, first, high, last) if axis == 1 else (first, low, last, high)
@@ -122,6 +128,18 @@ def _edge(frame: Int[np.ndarray, "height width"], i: int) -> _Edge | None:
         return None
     middle = float((mask.sum(1) * np.arange(len(mask))).sum() / mask.sum())
     return _Edge(int(rows[0] + deep), int(flat[0]), int(flat[-1]), int(rows[-1]), middle)
+
+
+def _unseen(empty: Bool[np.ndarray, "height width"], row: int, low: int, high: int) -> tuple[int, int] | None:
+    """(first column, column after the last) of the longest part of a border beyond which nothing is ever seen; None where that is
+    not most of it: what hides may end there."""
+    beyond = empty[max(row - DEEP, 0) : row, low:high]
+    if len(beyond) < DEEP:
+        return None
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], beyond.all(0).astype(np.int8), [0]])))
+    runs = [(int(a), int(b)) for a, b in zip(ends[::2], ends[1::2], strict=True)]
+    first, last = max(runs, key=lambda run: run[1] - run[0], default=(0, 0))
+    return (low + first, low + last) if last - first > MOST_OF * (high - low) else None
 
 
 def _grown(empty: Bool[np.ndarray, "height width"], row: int, low: int, high: int, extent: int) -> tuple[int, int, int]:

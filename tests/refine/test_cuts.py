@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mjx_refine.diagnosis import cuts
 from mjx_refine.diagnosis.cuts import cut_places
 
 ROWS, COLUMNS = np.mgrid[:120, :160]
@@ -54,4 +55,16 @@ def test_what_slides_along_a_floor_is_cut_nowhere():
 def test_what_another_object_hides_is_hidden_by_nothing_else():
     masks = falling()[:9]
     masks[:, 70:, :] = 2
+    assert cut_places(masks) == ()
+
+
+def test_what_hides_may_end_where_a_mask_goes_by(monkeypatch):
+    # In one frame the disc is seen beyond the line, right of the corner.
+    masks = falling(hidden=(20, 70, 69, 118), step=(-2.0, 5.0))[:9]
+    beyond = masks[:, 70:].any((0, 1))
+    assert 0 < np.count_nonzero(beyond) < 8
+    box = cut_places(masks)[0]
+    assert abs(box.top - 70) <= 1.5
+    assert abs(box.right - 69) <= 1.5
+    monkeypatch.setattr(cuts, "MOST_OF", 1.0)
     assert cut_places(masks) == ()

@@ -78,6 +78,26 @@ def test_what_comes_nearer_is_not_hidden():
     assert gap_between(_covered(2.0, hides=False)) == 0.0
 
 
+def _nudged(by: float) -> np.ndarray:
+    """A small disc before the rim of a large one, both masks too thin by so much [px]."""
+    masks = np.zeros((FRAMES, HEIGHT, WIDTH), np.int32)
+    for t in range(FRAMES):
+        near, far = _disc(112 + 0.4 * t, 45, 8), _disc(80, 45, 32)
+        masks[t][_thinner(far & ~near, by)] = 2
+        masks[t][_thinner(near, by)] = 1
+    return masks
+
+
+@pytest.mark.parametrize("by", [2.0, 4.0])
+def test_a_bite_tells_of_a_gap_however_short_it_is(by, monkeypatch):
+    # Longer outlines than these tell of it by themselves.
+    monkeypatch.setattr(gaps, "LEAST_PIXELS", 99)
+    assert gap_between(_nudged(by)) == pytest.approx(2 * by, abs=1.5)
+    assert gap_between(_nudged(0.0)) == 0.0
+    monkeypatch.setattr(gaps, "BITTEN", 99)
+    assert gap_between(_nudged(by)) == 0.0
+
+
 def test_outlines_along_a_gap_are_not_measured():
     masks = _passing(4.0)
     flow = np.zeros((FRAMES - 1, HEIGHT, WIDTH, 2), np.float32)
