@@ -9,6 +9,7 @@ import numpy as np
 from mjx_refine.diagnosis.candidates import Candidate, in_order, lead_of, leans_on, unit_of
 from mjx_refine.diagnosis.exchange import Fitted, Key, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
+from mjx_refine.diagnosis.given import far_from_given
 from mjx_refine.diagnosis.knock import knocked, to_the_end
 from mjx_refine.diagnosis.leads import FORGIVING, begun, chosen_of
 from mjx_refine.diagnosis.patches import patches_from_pushes
@@ -91,6 +92,9 @@ def singles_of(
                 base, ended, unbent = annealed(clip, base, names, shown, seed, told, lambda lead: words(lead, scene))
                 for lead, fit in ended:
                     _keep(clip, fitted, (lead.name, lead.target), fit, lead.gain)
+                told("from the given scene")
+                for key, fit in far_from_given(clip, base, names, view):
+                    _keep(clip, fitted, key, fit, 0.0)
             elif not video:
                 rows += _from_given(clip, base, names, shown)
         _keep_leads(clip, base, fitted, rows, told, scene)

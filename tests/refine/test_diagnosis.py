@@ -155,7 +155,7 @@ def test_what_nothing_else_looks_like_is_unmistakable_where_it_leads_by_far(monk
     )
 
 
-SIGNS = Signs(300.0, 150.0, 0.0, 1.4, 0.8, 10.0, 1.2, 80.0, 1.0)
+SIGNS = Signs(300.0, 150.0, 0.0, 1.25, 0.8, 10.0, 1.2, 80.0, 1.0)
 
 
 def changed(changes):
@@ -168,8 +168,10 @@ def changed(changes):
     [
         ({}, "single"),
         ({"lead": 20.0}, "none"),
-        ({"lead": 20.0, "before": 1.65}, "unknown"),
-        ({"lead": 20.0, "before": 1.55}, "none"),
+        ({"lead": 20.0, "before": 1.65, "drawn": 1.0}, "unknown"),
+        ({"lead": 20.0, "before": 1.55, "drawn": 1.0}, "none"),
+        ({"lead": 20.0, "before": 1.35}, "unknown"),
+        ({"lead": 20.0, "before": 1.25}, "none"),
         ({"lead": 20.0, "structure_after": 9.0}, "unknown"),
         ({"lead": 5.0, "whole": 9.0}, "unknown"),
         ({"structure_after": 40.0, "after": 5.0}, "unknown"),
@@ -219,14 +221,16 @@ def changed(changes):
         ({"closed": 0.05, "held_out": 20.0, "inimitable": 1.0}, "unknown"),
         ({"after": 2.2}, "unknown"),
         ({"after": 2.2, "unmistakable": 1.0}, "single"),
-        ({"structure_after": 9.0, "unmistakable": 1.0}, "single"),
-        ({"structure_first": 9.0, "unmistakable": 1.0}, "single"),
+        ({"structure_after": 9.0, "structure_first": 5.9, "unmistakable": 1.0}, "single"),
+        ({"structure_after": 5.9, "unmistakable": 1.0}, "single"),
+        ({"structure_first": 6.1, "unmistakable": 1.0}, "unknown"),
+        ({"structure_first": 6.1, "unmistakable": 1.0, "pair": 200.0}, "pair"),
         ({"closed": 0.2, "unmistakable": 1.0}, "single"),
         ({"closed": 0.05, "unmistakable": 1.0, "before": 1.9}, "unknown"),
         ({"closed": 0.05, "unmistakable": 1.0, "before": 2.1}, "single"),
         ({"closed": 0.05, "before": 2.1}, "unknown"),
         ({"closed": 0.05, "unmistakable": 1.0, "before": 2.1, "structure_after": 1.4}, "unknown"),
-        ({"pair": 200.0, "structure_after": 9.0, "unmistakable": 1.0}, "single"),
+        ({"pair": 200.0, "structure_after": 9.0, "structure_first": 5.9, "unmistakable": 1.0}, "single"),
         ({"pair": 200.0, "unmistakable": 1.0}, "pair"),
         ({"lead": 20.0, "after": 2.2, "unmistakable": 1.0}, "unknown"),
         ({"pair": 200.0, "structure_after": 9.0, "structure_first": 90.0}, "unknown"),
@@ -290,8 +294,8 @@ def test_poses_may_err_smoothly_and_more_than_their_noise_says(changes):
         ({"after": 5.0}, True),
         ({"lead": 20.0, "held_out": 0.0}, True),
         ({"lead": 20.0, "held_out": 9.0}, False),
-        ({"lead": 20.0, "held_out": 0.0, "before": 1.55}, True),
-        ({"lead": 20.0, "held_out": 0.0, "before": 1.65}, False),
+        ({"lead": 20.0, "held_out": 0.0, "before": 1.25}, True),
+        ({"lead": 20.0, "held_out": 0.0, "before": 1.35}, False),
     ],
 )
 def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, likely):
