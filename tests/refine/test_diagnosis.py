@@ -170,6 +170,8 @@ def changed(changes):
         ({"lead": 20.0}, "none"),
         ({"lead": 20.0, "before": 1.65, "drawn": 1.0}, "unknown"),
         ({"lead": 20.0, "before": 1.55, "drawn": 1.0}, "none"),
+        ({"lead": 20.0, "before": 1.65, "drawn": 1.0, "structure_before": 0.9}, "none"),
+        ({"lead": 20.0, "before": 1.35, "structure_before": 0.9}, "unknown"),
         ({"lead": 20.0, "before": 1.35}, "unknown"),
         ({"lead": 20.0, "before": 1.25}, "none"),
         ({"lead": 20.0, "structure_after": 9.0}, "unknown"),
@@ -296,6 +298,7 @@ def test_poses_may_err_smoothly_and_more_than_their_noise_says(changes):
         ({"lead": 20.0, "held_out": 9.0}, False),
         ({"lead": 20.0, "held_out": 0.0, "before": 1.25}, True),
         ({"lead": 20.0, "held_out": 0.0, "before": 1.35}, False),
+        ({"lead": 20.0, "held_out": 0.0, "before": 1.65, "drawn": 1.0, "structure_before": 0.9}, False),
     ],
 )
 def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, likely):
