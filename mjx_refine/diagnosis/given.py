@@ -28,9 +28,9 @@ iterations: along the path where those steps ended, and along their own. (A roll
 the withheld exams, and a centre of mass of a cylinder that rolls, 056, had not been found beside an H200.)"""
 
 LEAVES, LEAVES_OF_MEASURED_FLOW = 1.0, 1.45
-"""Mean square that the base model must leave for that to be worth its time; the same where the flow was measured. Of clips without
-effect of seeds 19 to 35 of the withheld exams 9 and 6 % leave more in the end, of those on which an effect was missed 65 and
-58 %."""
+"""Mean square that the base model must leave for that to be worth its time; the same where the flow was measured. Of clips
+without effect of seeds 19 to 35 of the withheld exams 9 and 6 % leave more in the end, of those on which an effect was missed
+65 and 58 %."""
 
 
 def far_from_given(clip: ClipFit, base: Fit, names: list[str], view: FitView) -> list[tuple[tuple[str, int], Fit]]:
