@@ -20,7 +20,6 @@ LEAST_PIXELS = 30
 DEEP = 3
 """How far nothing at all must be seen beyond the line [px]."""
 
-
 MOST_OF = 0.8
 """Part of the border beyond which that must be so."""
 

@@ -7,6 +7,7 @@ what it does may be less than that. From the given scene with two prior widths o
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -33,7 +34,9 @@ without effect of seeds 19 to 35 of the withheld exams 9 and 6 % leave more in t
 65 and 58 %."""
 
 
-def far_from_given(clip: ClipFit, base: Fit, names: list[str], view: FitView) -> list[tuple[tuple[str, int], Fit]]:
+def far_from_given(
+    clip: ClipFit, base: Fit, names: list[str], view: FitView, told: Callable[[str], None]
+) -> list[tuple[tuple[str, int], Fit]]:
     """Fits of the most promising such effects, by name and target.
 
     Args:
@@ -41,9 +44,11 @@ def far_from_given(clip: ClipFit, base: Fit, names: list[str], view: FitView) ->
       base: the base model's fit, whose hypothesis is begun from.
       names: of the catalogue.
       view: what kinds need to know.
+      told: called with a line where that is worth its time.
     """
     if clip.misfit(base) < (LEAVES_OF_MEASURED_FLOW if clip.measured.drawn else LEAVES):
         return []
+    told("from the given scene")
     rows = [
         (base.hypothesis, view, name, target, k, width)
         for name in names

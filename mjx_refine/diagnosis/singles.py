@@ -92,8 +92,7 @@ def singles_of(
                 base, ended, unbent = annealed(clip, base, names, shown, seed, told, lambda lead: words(lead, scene))
                 for lead, fit in ended:
                     _keep(clip, fitted, (lead.name, lead.target), fit, lead.gain)
-                told("from the given scene")
-                for key, fit in far_from_given(clip, base, names, view):
+                for key, fit in far_from_given(clip, base, names, view, told):
                     _keep(clip, fitted, key, fit, 0.0)
             elif not video:
                 rows += _from_given(clip, base, names, shown)

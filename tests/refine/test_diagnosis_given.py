@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from test_diagnosis_tempered import ROLL, started_with
+from test_diagnosis_tempered import ROLL, quiet, started_with
 
 from mjx_refine.diagnosis import given
 from mjx_refine.diagnosis.given import GO_ON, far_from_given
@@ -18,7 +18,9 @@ def rolled():
 
 def test_a_rolled_camera_is_found_from_the_given_scene(rolled):
     clip, base, view = rolled
-    found = dict(far_from_given(clip, base, ["camera_roll", "wind", "magnus"], view))
+    lines: list[str] = []
+    found = dict(far_from_given(clip, base, ["camera_roll", "wind", "magnus"], view, lines.append))
+    assert lines == ["from the given scene"]
     # What costs far more after the first steps does not go on.
     assert set(found) == {("camera_roll", -1)}
     fit = found["camera_roll", -1]
@@ -30,11 +32,9 @@ def test_only_the_most_promising_of_what_is_imitated_go_on(rolled, monkeypatch):
     clip, base, view = rolled
     monkeypatch.setattr(given, "CLOSE", 1e9)
     # A wind is nothing that ordinary numbers imitate.
-    assert set(dict(far_from_given(clip, base, ["camera_roll", "wind", "magnus"], view))) == {
-        ("camera_roll", -1),
-        ("magnus", 0),
-    }
-    found = far_from_given(clip, base, ["camera_roll", "slope", "mask_bias", "magnus"], view)
+    found = far_from_given(clip, base, ["camera_roll", "wind", "magnus"], view, quiet)
+    assert set(dict(found)) == {("camera_roll", -1), ("magnus", 0)}
+    found = far_from_given(clip, base, ["camera_roll", "slope", "mask_bias", "magnus"], view, quiet)
     assert len(found) == GO_ON
     assert ("camera_roll", -1) in dict(found)
 
@@ -42,4 +42,6 @@ def test_only_the_most_promising_of_what_is_imitated_go_on(rolled, monkeypatch):
 def test_a_base_model_that_leaves_noise_is_enough(rolled, monkeypatch):
     clip, base, view = rolled
     monkeypatch.setattr(given, "LEAVES", 2 * clip.misfit(base))
-    assert far_from_given(clip, base, ["camera_roll"], view) == []
+    lines: list[str] = []
+    assert far_from_given(clip, base, ["camera_roll"], view, lines.append) == []
+    assert lines == []
