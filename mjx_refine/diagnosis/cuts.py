@@ -138,7 +138,7 @@ def _unseen(empty: Bool[np.ndarray, "height width"], row: int, low: int, high: i
     ends = np.flatnonzero(np.diff(np.concatenate([[0], beyond.all(0).astype(np.int8), [0]])))
     runs = [(int(a), int(b)) for a, b in zip(ends[::2], ends[1::2], strict=True)]
     first, last = max(runs, key=lambda run: run[1] - run[0], default=(0, 0))
-    return (low + first, low + last) if last - first > MOST_OF * (high - low) else None
+    return (low + first, low + last) if last - first >= MOST_OF * (high - low) else None
 
 
 def _grown(empty: Bool[np.ndarray, "height width"], row: int, low: int, high: int, extent: int) -> tuple[int, int, int]:

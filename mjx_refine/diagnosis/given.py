@@ -6,9 +6,6 @@ what it does may be less than that. From the given scene with two prior widths o
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
-
 import numpy as np
 
 from mjx_refine.diagnosis.fit import ClipFit, Fit
@@ -16,6 +13,7 @@ from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import FORGIVING
 from mjx_refine.diagnosis.screen import term_of
+from mjx_refine.diagnosis.tempered import Told, cooled
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 
@@ -35,7 +33,7 @@ without effect of seeds 19 to 35 of the withheld exams 9 and 6 % leave more in t
 
 
 def far_from_given(
-    clip: ClipFit, base: Fit, names: list[str], view: FitView, told: Callable[[str], None]
+    clip: ClipFit, base: Fit, names: list[str], view: FitView, told: Told
 ) -> list[tuple[tuple[str, int], Fit]]:
     """Fits of the most promising such effects, by name and target.
 
@@ -68,20 +66,11 @@ def far_from_given(
 
 
 def _begun(clip: ClipFit, plain: Hypothesis, view: FitView, name: str, target: int, k: int, width: float) -> Fit:
-    kind = catalogue()[name]
-    still = kind.still(view, target)
-    values = still.values.copy()
-    values[k] += width * float(kind.widths(view, target)[k])
-    one = term_of(name, target, still, clip.frames)
-    hypothesis = plain.added(one)
-    z = np.concatenate([np.zeros(plain.dimension), one.at(values[None])[0]])
-    return clip.fit(hypothesis, z, FIRST, scale=FORGIVING, attempts=FIRST, thorough=False)
+    one = term_of(name, target, catalogue()[name].still(view, target), clip.frames)
+    z = np.concatenate([np.zeros(plain.dimension), (width * np.eye(len(one.centre))[k])[one.free]])
+    return clip.fit(plain.added(one), z, FIRST, scale=FORGIVING, attempts=FIRST, thorough=False)
 
 
 def _on(clip: ClipFit, fit: Fit) -> Fit:
-    fit = clip.fit(_along(clip, fit), fit.z, FURTHER, thorough=False)
-    return knocked(clip, clip.fit(_along(clip, fit), fit.z, REST))
-
-
-def _along(clip: ClipFit, fit: Fit) -> Hypothesis:
-    return dataclasses.replace(fit.hypothesis, slack=clip.slack_along(fit))
+    fit = clip.fit(cooled(clip, fit), fit.z, FURTHER, thorough=False)
+    return knocked(clip, clip.fit(cooled(clip, fit), fit.z, REST))

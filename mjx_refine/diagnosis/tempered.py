@@ -144,7 +144,7 @@ def beside_tempered(
 
 
 def cooled(clip: ClipFit, fit: Fit) -> Hypothesis:
-    """The hypothesis of a tempered fit with what contacts along its path may err by."""
+    """A fit's hypothesis with what contacts along its path may err by."""
     return dataclasses.replace(fit.hypothesis, slack=clip.slack_along(fit))
 
 
