@@ -73,7 +73,14 @@ def _foretold(path: Path, key: dict[str, Any], scene: Scene) -> Foretold:
     batch = on_the_floor(batch_with_effects([scene]))
     poses = MujocoSimulator(scene.shapes, seen.fps, 1).rollout(batch, seen.length)
     predictor = Predictor(
-        scene.shapes, measured.pixels, measured.places, seen.size, seen.fps, measured.blur, measured.drawn
+        scene.shapes,
+        measured.pixels,
+        measured.places,
+        seen.size,
+        seen.fps,
+        measured.blur,
+        measured.drawn,
+        measured.shared,
     )
     told = predictor(poses, batch)
     moments = (measured.moments - told.moments[0])[:FIRST]

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
+from mjx_refine.diagnosis.before import before_others
 from mjx_refine.diagnosis.gaps import gap_between
 from mjx_refine.observation import Observation
 from mjx_refine.search.features import flow_points, outlines
@@ -82,6 +83,8 @@ class Measured:
       stated: whether the clip says how noisy its flow is.
       drawn: whether the flow was measured, and so drawn along by outlines: its noise is not stated, or by pixel, as only a
         measurement's is.
+      shared: by how much centroid and equivalent radius of a mask that is before another fall short, for each pixel by which
+        masks are too fat [px/px]; None: by nothing.
     """
 
     reach: Float[np.ndarray, "frames objects directions"]
@@ -97,6 +100,7 @@ class Measured:
     background_noise: float
     stated: bool
     drawn: bool = False
+    shared: Float[np.ndarray, "frames objects 3"] | None = None
 
     @functools.cached_property
     def freshness(self) -> Float[np.ndarray, "frames objects"]:
@@ -166,7 +170,8 @@ def measure(observation: Observation, columns: tuple[int, ...], near: int = 0) -
     chosen, lost = [max(j, 0) for j in columns], np.array([j < 0 for j in columns])
     reach = np.where(lost[None, :, None], np.nan, seen.support[:, chosen])
     flow = np.where(lost[None, :, None, None], np.nan, flow[:-1, chosen])
-    moments = np.where(lost[None, :, None], np.nan, whole_masks(masks, seen.ids, near)[:, chosen])
+    before = before_others(masks, seen.ids, near)
+    moments = np.where(lost[None, :, None], np.nan, whole_masks(masks, seen.ids, near, before.whole)[:, chosen])
     places, background = _beside(masks, observation.flow)
     sigma = observation.flow_sigma
     given = float(np.nanmedian(sigma)) if sigma is not None else 0.0
@@ -185,6 +190,7 @@ def measure(observation: Observation, columns: tuple[int, ...], near: int = 0) -
         background_noise=max(1.5 * _spread(background), given / 3, 0.05),
         stated=sigma is not None,
         drawn=sigma is None or np.ndim(sigma) > 0,
+        shared=before.shared[:, chosen],
     )
 
 

@@ -94,6 +94,8 @@ class Predictor:
       fps: frames a second.
       blur: how far from an outline the flow beside it is still much like the object's [px].
       drawn: whether outlines draw the flow along, as they do where it was measured.
+      shared: by how much centroids and equivalent radii fall short for each pixel by which masks are too fat, where these
+        border on what lies behind them [px/px]; None: by nothing.
     """
 
     def __init__(
@@ -105,9 +107,10 @@ class Predictor:
         fps: float,
         blur: float = 0.0,
         drawn: bool = False,
+        shared: Float[np.ndarray, "frames objects 3"] | None = None,
     ):
         self.shapes, self.pixels, self.places, self.image, self.fps = shapes, pixels, places, image, fps
-        self.blur, self.drawn = blur, drawn
+        self.blur, self.drawn, self.shared = blur, drawn, shared
 
     def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Prediction:
         """The prediction for ``poses`` (of ``Simulator.rollout``) seen with the camera and effects of ``batch``."""
@@ -134,6 +137,8 @@ class Predictor:
             beside = self._beside(told[0], directions(count)) * np.minimum(wide, 1.0)[:, None, None, None]
             around = background[:, np.arange(flow.shape[1])[:, None, None], self._nearest]
             flow = flow + beside[..., None] * (around - flow)
+            if self.shared is not None:
+                whole = whole - np.maximum(wide, 0.0)[:, None, None, None] * self.shared
         return Prediction(reach, flow, whole, background, bad)
 
     def _changed(self, told: Sequence[np.ndarray], batch: SceneBatch, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy import ndimage
 
 from mjx_refine.scene import Shape
@@ -179,11 +179,16 @@ def moments(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int, int]) -
 
 
 def mask_moments(
-    masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...], least: int = 12, near: int = BESIDE
+    masks: Int[np.ndarray, "frames height width"],
+    ids: tuple[int, ...],
+    least: int = 12,
+    near: int = BESIDE,
+    before: Bool[np.ndarray, "frames ids"] | None = None,
 ) -> Moments:
     """Moments of observed masks, (frames, ids), float64; NaN where they cannot be the whole silhouette's.
 
-    That is where the mask has fewer than ``least`` pixels, or comes within ``near`` of the border or of another mask.
+    That is where the mask has fewer than ``least`` pixels, or comes within ``near`` of the border or of another mask which it
+    is not known to be ``before``.
     """
     shape = (len(masks), len(ids))
     area, centroid, second = np.full(shape, np.nan), np.full((*shape, 2), np.nan), np.full((*shape, 2, 2), np.nan)
@@ -197,7 +202,7 @@ def mask_moments(
             top, left = max(rows.min() - near, 0), max(columns.min() - near, 0)
             part = frame[top : rows.max() + near + 1, left : columns.max() + near + 1]
             around = ndimage.maximum_filter(part == i, size=2 * near + 1)
-            if (around & (part != i) & (part != 0)).any():
+            if (before is None or not before[t, j]) and (around & (part != i) & (part != 0)).any():
                 continue
             points = np.stack([columns + 0.5, rows + 0.5], -1)
             area[t, j], centroid[t, j] = len(points), points.mean(0)
@@ -206,10 +211,13 @@ def mask_moments(
 
 
 def whole_masks(
-    masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...], near: int = BESIDE
+    masks: Int[np.ndarray, "frames height width"],
+    ids: tuple[int, ...],
+    near: int = BESIDE,
+    before: Bool[np.ndarray, "frames ids"] | None = None,
 ) -> Float[np.ndarray, "frames ids 3"]:
     """Centroid and equivalent radius, that of a disc as large, of masks that are seen whole [px]; NaN elsewhere."""
-    found = mask_moments(masks, ids, near=near)
+    found = mask_moments(masks, ids, near=near, before=before)
     return np.concatenate([found.centroid, np.sqrt(found.area / np.pi)[..., None]], -1)
 
 
