@@ -29,12 +29,14 @@ class Before(NamedTuple):
 
     Attributes:
       whole: whether a mask is one.
+      ahead: by frame, pairs of ids of which the first is known to be before the second.
       shared: by how much its centroid (x, y) and its equivalent radius fall short of those of a mask that is too fat all
         around, for each pixel by which masks are too fat: where it borders on another mask it cannot be wider [px/px]; 0
         elsewhere.
     """
 
     whole: Bool[np.ndarray, "frames ids"]
+    ahead: list[set[tuple[int, int]]]
     shared: Float[np.ndarray, "frames ids 3"]
 
 
@@ -44,21 +46,22 @@ def before_others(masks: Int[np.ndarray, "frames height width"], ids: tuple[int,
     Of two convex bodies that do not overlap one is before the other wherever both are in sight, so that nothing hides the
     former; and that stays so for as long as their pictures touch, even where a border is too straight to tell.
     """
-    near_by = [_neighbours(frame, ids, near) for frame in masks]
+    near_by = [neighbours(frame, ids, near) for frame in masks]
     pairs = sorted({pair for one in near_by for pair in one})
-    ahead = {pair: _ahead(masks, pair, np.array([pair in one for one in near_by])) for pair in pairs}
+    told = {pair: _ahead(masks, pair, np.array([pair in one for one in near_by])) for pair in pairs}
+    ahead = [{pair for pair in pairs if told[pair][t]} for t in range(len(masks))]
     whole = np.zeros((len(masks), len(ids)), bool)
     shared = np.zeros((*whole.shape, 3))
     for t, frame in enumerate(masks):
         for j, i in enumerate(ids):
             others = [other for one, other in near_by[t] if one == i]
-            whole[t, j] = bool(others) and all(ahead[i, other][t] for other in others)
+            whole[t, j] = bool(others) and all((i, other) in ahead[t] for other in others)
             if whole[t, j]:
                 shared[t, j] = _shared(frame == i, np.isin(frame, others))
-    return Before(whole, shared)
+    return Before(whole, ahead, shared)
 
 
-def _neighbours(frame: np.ndarray, ids: tuple[int, ...], near: int) -> set[tuple[int, int]]:
+def neighbours(frame: np.ndarray, ids: tuple[int, ...], near: int) -> set[tuple[int, int]]:
     """Pairs of masks that come within ``near`` pixels of one another, either way round."""
     found = set()
     for i, box in enumerate(ndimage.find_objects(frame), 1):

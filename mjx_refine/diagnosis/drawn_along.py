@@ -43,14 +43,19 @@ def drawn_along(
     return flow - (1 - SHOWS) * against(flow, moments)
 
 
-def uncertain(measured: Measured, told: Parts) -> Parts:
+def uncertain(
+    measured: Measured,
+    flow: Float[np.ndarray, "1 intervals objects points 2"],
+    moments: Float[np.ndarray, "1 frames objects 3"],
+) -> Parts:
     """What measured flow may err by since nobody knows how far outlines draw it, one standard deviation a row [px].
 
     Args:
       measured: what was seen; where nothing was, nothing errs.
-      told: the prediction (batch 1), drawn along.
+      flow: that is predicted, drawn along [px/frame].
+      moments: predicted centroids and equivalent radii of whole silhouettes [px].
     """
-    moved = np.where(np.isfinite(measured.flow), against(told.flow, told.moments)[0], 0.0) / SHOWS
+    moved = np.where(np.isfinite(measured.flow), against(flow, moments)[0], 0.0) / SHOWS
     mean = np.broadcast_to(moved.mean(-2, keepdims=True), moved.shape)
     later = np.linspace(-1.0, 1.0, len(moved))[:, None, None, None]
     courses = (np.ones_like(later), later)
@@ -61,13 +66,17 @@ def uncertain(measured: Measured, told: Parts) -> Parts:
     ]
     each = np.nan_to_num(np.stack(rows))
     objects = np.arange(moved.shape[1])
-    flow = np.zeros((len(rows), len(objects), *moved.shape))
-    flow[:, objects, :, objects] = np.moveaxis(each, 2, 0)
+    off = np.zeros((len(rows), len(objects), *moved.shape))
+    off[:, objects, :, objects] = np.moveaxis(each, 2, 0)
     blank = (np.zeros((len(rows) * len(objects), *part.shape)) for part in measured.parts)
-    return Parts(*blank)._replace(flow=flow.reshape(-1, *moved.shape))
+    return Parts(*blank)._replace(flow=off.reshape(-1, *moved.shape))
 
 
-def always_off(measured: Measured, told: Parts) -> Parts:
-    """What measurements may err by whatever contacts do, one standard deviation a row [px]; ``told``: the prediction."""
+def always_off(
+    measured: Measured,
+    flow: Float[np.ndarray, "1 intervals objects points 2"],
+    moments: Float[np.ndarray, "1 frames objects 3"],
+) -> Parts:
+    """What measurements may err by whatever contacts do, one standard deviation a row [px]; the rest as in ``uncertain``."""
     wide = too_wide(measured)
-    return wide.beside(uncertain(measured, told)) if measured.drawn else wide
+    return wide.beside(uncertain(measured, flow, moments)) if measured.drawn else wide

@@ -54,7 +54,7 @@ class ClipFit:
         self.simulator, self.measured, self.image, self.frames = simulator, measured, image, frames
         self.noise = noise or everywhere(measured, frames)
         m, shapes, fps = measured, simulator.shapes, simulator.fps
-        self.predictor = Predictor(shapes, m.pixels, m.places, image, fps, m.blur, m.drawn, m.shared)
+        self.predictor = Predictor(shapes, m.pixels, m.places, image, fps, m.blur, m.drawn, m.shared, m.planes)
         self.rollouts, self.counts, self.slackness = 0.0, Counts(), 1.0
         self.store, self.crew = Store(), Crew()
         self._loose: Loose | None = None
@@ -144,8 +144,8 @@ class ClipFit:
 
     def _loosened(self, batch: SceneBatch, poses: np.ndarray, found: list[Impact], still: Prediction, kicks) -> Loose:
         sharp, marks = self.noise, [(i.target, i.frame) for i in found]
-        always = always_off(self.measured, still.parts)
-        return Loose(always, kicks, lambda part: blurred(sharp, still.moments[0], marks, part))
+        always = always_off(self.measured, still.flow, still.whole)
+        return Loose(always, kicks, lambda part: blurred(sharp, still.whole[0], marks, part))
 
     def kicks(self, batch: SceneBatch, poses: np.ndarray, still: Prediction, found: list[Impact], part: float) -> Parts:
         """What impacts that err by ``part`` of themselves change in what ``still`` predicts, one standard deviation a row."""

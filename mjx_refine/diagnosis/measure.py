@@ -14,6 +14,7 @@ from scipy import ndimage
 
 from mjx_refine.diagnosis.before import before_others
 from mjx_refine.diagnosis.gaps import gap_between
+from mjx_refine.diagnosis.partly import half_planes, masks_within
 from mjx_refine.observation import Observation
 from mjx_refine.search.features import flow_points, outlines
 from mjx_refine.view.moments import BESIDE, whole_masks
@@ -70,7 +71,8 @@ class Measured:
 
     Attributes:
       reach: how far each object's mask reaches [px]; NaN where that is not known.
-      moments: of each mask that is seen whole: its centroid and the radius of a disc as large [px]; NaN elsewhere.
+      moments: of each mask that is seen whole, or of what of it lies within its half plane: its centroid and the radius of a
+        disc as large [px]; NaN elsewhere.
       pixels: points of each mask.
       flow: the flow there [px/frame]; NaN where it was not measured.
       places: points of a grid over the picture [px].
@@ -85,6 +87,8 @@ class Measured:
         measurement's is.
       shared: by how much centroid and equivalent radius of a mask that is before another fall short, for each pixel by which
         masks are too fat [px/px]; None: by nothing.
+      planes: (normal x, normal y, offset) [px] of the half plane n . p <= o within which a mask is its object's whole
+        silhouette; NaN where the mask is that itself, and where nothing is known; None: nowhere.
     """
 
     reach: Float[np.ndarray, "frames objects directions"]
@@ -101,6 +105,12 @@ class Measured:
     stated: bool
     drawn: bool = False
     shared: Float[np.ndarray, "frames objects 3"] | None = None
+    planes: Float[np.ndarray, "frames objects 3"] | None = None
+
+    @property
+    def whole(self) -> Float[np.ndarray, "frames objects 3"]:
+        """``moments`` of masks that are seen whole alone."""
+        return self.moments if self.planes is None else np.where(np.isfinite(self.planes), np.nan, self.moments)
 
     @functools.cached_property
     def freshness(self) -> Float[np.ndarray, "frames objects"]:
@@ -140,7 +150,7 @@ class Measured:
     def without_what_lacks(self, told: Measured) -> Measured:
         """The same, but for outlines and whole masks of which ``told`` knows nothing."""
         reach = np.where(np.isnan(told.reach), np.nan, self.reach)
-        return dataclasses.replace(self, reach=reach, moments=np.where(np.isnan(told.moments), np.nan, self.moments))
+        return dataclasses.replace(self, reach=reach, moments=np.where(np.isnan(told.whole), np.nan, self.moments))
 
     def kept(self, keep: Bool[np.ndarray, "frames"]) -> Bool[np.ndarray, "residuals"]:
         """Which numbers of ``Parts.flat`` belong to kept frames."""
@@ -171,14 +181,16 @@ def measure(observation: Observation, columns: tuple[int, ...], near: int = 0) -
     reach = np.where(lost[None, :, None], np.nan, seen.support[:, chosen])
     flow = np.where(lost[None, :, None, None], np.nan, flow[:-1, chosen])
     before = before_others(masks, seen.ids, near)
-    moments = np.where(lost[None, :, None], np.nan, whole_masks(masks, seen.ids, near, before.whole)[:, chosen])
+    whole = np.where(lost[None, :, None], np.nan, whole_masks(masks, seen.ids, near, before.whole)[:, chosen])
+    planes = half_planes(masks, seen.ids, near, before)
+    parts = np.where(lost[None, :, None], np.nan, masks_within(masks, seen.ids, planes)[:, chosen])
     places, background = _beside(masks, observation.flow)
     sigma = observation.flow_sigma
     given = float(np.nanmedian(sigma)) if sigma is not None else 0.0
     present = np.isfinite(seen.centre[:, chosen, 0]) & ~lost
     return Measured(
         reach=reach,
-        moments=moments,
+        moments=np.where(np.isnan(whole), parts, whole),
         pixels=pixels[:, chosen],
         flow=flow,
         places=places,
@@ -186,11 +198,12 @@ def measure(observation: Observation, columns: tuple[int, ...], near: int = 0) -
         present=present,
         edge_noise=np.maximum(_roughness(reach), EDGE_FLOOR),
         flow_noise=_flow_noise(pixels[:-1, chosen], flow, given),
-        moment_noise=moment_roughness(moments),
+        moment_noise=moment_roughness(whole),
         background_noise=max(1.5 * _spread(background), given / 3, 0.05),
         stated=sigma is not None,
         drawn=sigma is None or np.ndim(sigma) > 0,
         shared=before.shared[:, chosen],
+        planes=planes[:, chosen],
     )
 
 

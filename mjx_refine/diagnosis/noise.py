@@ -131,7 +131,7 @@ def settled(measured: Measured, residual: Parts, counts: Counts, order: int = 1)
     flow = m.flow_noise * np.clip(rough(residual.flow, m.flow, share[1]), 0.7, 3.0)
     each = [rough(residual.moments[..., k], m.moments[..., k], share[2]) for k in range(3)]
     moments = m.moment_noise * np.clip(np.stack(each, -1), 0.6, 3.0)
-    moments = np.minimum(moments, MORE_THAN_ROUGH * moment_roughness(m.moments))
+    moments = np.minimum(moments, MORE_THAN_ROUGH * moment_roughness(m.whole))
     edge_count = float(np.clip(_independent(np.diff(residual.reach, axis=0)), *EDGE_COUNTS))
     told = float(np.clip(_independent(np.moveaxis(np.diff(residual.flow, axis=0), -1, -2)), *FLOW_COUNTS))
     # Flow whose noise is not stated was measured, and errs smoothly in time as well.

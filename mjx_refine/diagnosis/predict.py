@@ -28,8 +28,10 @@ from mjx_refine.view.seen import (
     bends,
     bent_flow,
     changed_moments,
+    changed_polygon,
     directions_for,
     focal_length,
+    moments_within,
     outline_function,
     straight_pixels,
 )
@@ -52,9 +54,10 @@ class Prediction:
     Attributes:
       reach: support functions of the silhouettes [px]; NaN where nothing is seen.
       flow: at the measured points of the objects [px/frame].
-      moments: centroids and equivalent radii of the silhouettes [px].
+      moments: centroids and equivalent radii [px] of the silhouettes, or of what of them lies within ``Measured.planes``.
       background: flow at the measured points beside the objects [px/frame].
       bad: candidates that diverged.
+      whole: centroids and equivalent radii of whole silhouettes [px].
     """
 
     reach: Float[np.ndarray, "batch frames objects directions"]
@@ -62,6 +65,7 @@ class Prediction:
     moments: Float[np.ndarray, "batch frames objects 3"]
     background: Float[np.ndarray, "batch intervals places 2"]
     bad: np.ndarray
+    whole: Float[np.ndarray, "batch frames objects 3"]
 
     @property
     def parts(self) -> Parts:
@@ -96,6 +100,7 @@ class Predictor:
       drawn: whether outlines draw the flow along, as they do where it was measured.
       shared: by how much centroids and equivalent radii fall short for each pixel by which masks are too fat, where these
         border on what lies behind them [px/px]; None: by nothing.
+      planes: half planes within which masks are known, as ``Measured`` has them.
     """
 
     def __init__(
@@ -108,27 +113,34 @@ class Predictor:
         blur: float = 0.0,
         drawn: bool = False,
         shared: Float[np.ndarray, "frames objects 3"] | None = None,
+        planes: Float[np.ndarray, "frames objects 3"] | None = None,
     ):
         self.shapes, self.pixels, self.places, self.image, self.fps = shapes, pixels, places, image, fps
         self.blur, self.drawn, self.shared = blur, drawn, shared
+        self.planes = planes if planes is not None and np.isfinite(planes).any() else None
 
     def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Prediction:
         """The prediction for ``poses`` (of ``Simulator.rollout``) seen with the camera and effects of ``batch``."""
         bad = np.logical_not(np.isfinite(poses).all((1, 2, 3)))
         poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
         seen = acting.apparent(poses, batch, self.fps)
-        count = directions_for(batch, DIRECTIONS) if acting.changes_outlines(batch) else 0
+        changes = acting.changes_outlines(batch)
+        count = directions_for(batch, DIRECTIONS) if changes else 0
+        count = count if self.planes is None else max(count, min(MANY))
         bent = straight_pixels(seen, batch, self.pixels, self.image, self.fps) if bends(batch) else None
         told, whole, flow = self._predicted(seen, batch, self.pixels[None] if bent is None else bent[0], count)
         if bent is not None:
             flow = bent_flow(flow, bent[1], self.pixels, batch, self.image, self.fps)
         flow = flow[:, :-1]
-        reach = told[0]
+        reach, within = told[0][..., :: max(count // DIRECTIONS, 1)], whole
         if count:
             # Of a few rows at a time, which a core's cache holds, arrays in many directions take half as long.
             rows = [slice(first, first + CACHED) for first in range(0, len(seen), CACHED)]
-            changed = [self._changed([part[one] for part in (*told, whole)], batch[one], count) for one in rows]
-            reach, whole = (np.concatenate(part) for part in zip(*changed, strict=True))
+            if changes:
+                changed = [self._changed([part[one] for part in (*told, whole)], batch[one], count) for one in rows]
+                reach, whole, within = (np.concatenate(part) for part in zip(*changed, strict=True))
+            else:
+                within = np.concatenate([self._within(whole[one], told[1][one]) for one in rows])
         if self.drawn:
             flow = drawn_along(flow, whole)
         background = self._background(batch, len(poses), poses.shape[1])
@@ -138,11 +150,11 @@ class Predictor:
             around = background[:, np.arange(flow.shape[1])[:, None, None], self._nearest]
             flow = flow + beside[..., None] * (around - flow)
             if self.shared is not None:
-                whole = whole - np.maximum(wide, 0.0)[:, None, None, None] * self.shared
-        return Prediction(reach, flow, whole, background, bad)
+                within = within - np.maximum(wide, 0.0)[:, None, None, None] * self.shared
+        return Prediction(reach, flow, within, background, bad, whole)
 
-    def _changed(self, told: Sequence[np.ndarray], batch: SceneBatch, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Reach and moments once effects have changed the outlines of some rows."""
+    def _changed(self, told: Sequence[np.ndarray], batch: SceneBatch, count: int) -> tuple[np.ndarray, ...]:
+        """Reach, and moments of the whole and of what planes leave, once effects have changed the outlines of some rows."""
         reach, contact, facing, scale, whole = told
         focal = focal_length(batch, self.image)
         rate = np.gradient(reach, axis=1) if reach.shape[1] > 1 else np.zeros_like(reach)
@@ -151,7 +163,13 @@ class Predictor:
             reach, contact, rate, normals, facing, scale, focal, self.image, self.fps, batch.shapes, batch.size
         )
         change = acting.outline_change(batch, view)
-        return (reach + change)[..., :: count // DIRECTIONS], changed_moments(whole, batch, view, change)
+        moved, hidden = changed_polygon(batch, view, change)
+        whole = changed_moments(whole, view, change, moved, hidden)
+        return (reach + change)[..., :: count // DIRECTIONS], whole, self._within(whole, moved, hidden)
+
+    def _within(self, whole: np.ndarray, moved: np.ndarray, hidden: np.ndarray | None = None) -> np.ndarray:
+        """Moments of what planes leave."""
+        return whole if self.planes is None else moments_within(whole, self.planes, moved, hidden)
 
     @functools.cached_property
     def _nearest(self) -> Int[np.ndarray, "intervals objects points"]:

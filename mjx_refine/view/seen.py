@@ -24,6 +24,9 @@ MANY = 64, 128
 """Directions that effects ask for, so that what is compiled is known: 64 tell what bulges, is worn or is hidden, 128 what is left
 of corners where outlines shrink."""
 
+LEAST_AREA = 1.0
+"""Area [px^2] below which a part of a silhouette has no centroid."""
+
 UNBENDING = 6
 """Steps that undo a lens, each of which leaves at most 3 |k1| r^2 of what the last one left (r in focal lengths)."""
 
@@ -58,19 +61,17 @@ def outline_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int
 _outline = jit_quickly(outline_function, static_argnums=(0, 2, 3))
 
 
-def changed_moments(
-    moments: Float[np.ndarray, "batch frames objects 3"],
-    batch: SceneBatch,
-    view: OutlineView,
-    change: Float[np.ndarray, "batch frames objects directions"],
-) -> Float[np.ndarray, "batch frames objects 3"]:
-    """Centroids and equivalent radii [px] of silhouettes that effects change by ``change``, or hide in part.
+def changed_polygon(
+    batch: SceneBatch, view: OutlineView, change: Float[np.ndarray, "batch frames objects directions"]
+) -> tuple[
+    Float[np.ndarray, "batch frames objects directions 2"], Float[np.ndarray, "batch frames objects others 2"] | None
+]:
+    """Polygons of points of silhouettes that effects change by ``change``, and of what they hide of these [px], if anything.
 
     Points of the polygon of contact points go where effects move them, and to first order along its normals where these widen
-    it; the polygon's own moments' change is added to the exact ones. Where directions are many, what is widened moves along
-    its tangents as well, as gradients of the changed support function do.
+    it. Where directions are many, what is widened moves along its tangents as well, as gradients of the changed support
+    function do.
     """
-    before = polygon_sums(view.contact)
     shift = acting.outlines_moved(batch, view)
     moved = view.contact if shift is None else view.contact + shift
     hidden = acting.hidden_polygons(batch, moved)
@@ -80,9 +81,23 @@ def changed_moments(
         if change.shape[-1] >= min(MANY):
             slope = (np.roll(wider, -1, -1) - np.roll(wider, 1, -1)) / (4 * np.pi / wider.shape[-1])
             moved = moved + slope[..., None] * np.stack([-view.normals[:, 1], view.normals[:, 0]], -1)
-        after = polygon_sums(moved)
-    else:
-        after = polygon_sums(moved) - polygon_sums(hidden)
+    return moved, hidden
+
+
+def changed_moments(
+    moments: Float[np.ndarray, "batch frames objects 3"],
+    view: OutlineView,
+    change: Float[np.ndarray, "batch frames objects directions"],
+    moved: Float[np.ndarray, "batch frames objects directions 2"],
+    hidden: Float[np.ndarray, "batch frames objects others 2"] | None,
+) -> Float[np.ndarray, "batch frames objects 3"]:
+    """Centroids and equivalent radii [px] of silhouettes that effects change by ``change``, or hide in part.
+
+    What changes of the moments of polygons, of contact points and of ``changed_polygon``, is added to the exact ones.
+    """
+    before, after = polygon_sums(view.contact), polygon_sums(moved)
+    if hidden is not None:
+        after = after - polygon_sums(hidden)
     area = [np.maximum(np.abs(sums[..., 0]), 1e-9) for sums in (before, after)]
     middle = after[..., 1:] / area[1][..., None] - before[..., 1:] / area[0][..., None]
     ratio = np.sqrt(np.abs(after[..., 0]) / area[0])
@@ -91,10 +106,65 @@ def changed_moments(
     return np.where(seen[..., None], result, np.nan)
 
 
+def moments_within(
+    moments: Float[np.ndarray, "batch frames objects 3"],
+    planes: Float[np.ndarray, "frames objects 3"],
+    moved: Float[np.ndarray, "batch frames objects directions 2"],
+    hidden: Float[np.ndarray, "batch frames objects others 2"] | None = None,
+) -> Float[np.ndarray, "batch frames objects 3"]:
+    """Centroids and equivalent radii [px] of what of silhouettes lies within half planes.
+
+    Args:
+      moments: of whole silhouettes.
+      planes: (normal x, normal y, offset) of n . p <= o; NaN where there is none.
+      moved: polygons of points of the silhouettes, of which what lies beyond is taken away.
+      hidden: polygons of what is hidden of them anyway.
+    """
+    frames, objects = np.nonzero(np.isfinite(planes[..., 2]))
+    normal, offset = planes[frames, objects, :2], planes[frames, objects, 2]
+    origin = normal * offset[:, None]
+    whole = moments[:, frames, objects]
+    area = np.pi * whole[..., 2] ** 2
+    rest = np.concatenate([area[..., None], area[..., None] * (whole[..., :2] - origin)], -1)
+    rest = rest - _sums_beyond(moved[:, frames, objects] - origin[:, None], normal)
+    if hidden is not None:
+        rest = rest + _sums_beyond(hidden[:, frames, objects] - origin[:, None], normal)
+    left = rest[..., :1] > LEAST_AREA
+    within = np.concatenate(
+        [rest[..., 1:] / np.where(left, rest[..., :1], 1.0) + origin, np.sqrt(np.maximum(rest[..., :1], 0.0) / np.pi)],
+        -1,
+    )
+    result = moments.copy()
+    result[:, frames, objects] = np.where(left, within, np.nan)
+    return result
+
+
+def _sums_beyond(
+    points: Float[np.ndarray, "*grid corners 2"], normal: Float[np.ndarray, "lines 2"]
+) -> Float[np.ndarray, "*grid 3"]:
+    """``polygon_sums`` of the parts of convex polygons beyond lines through the origin.
+
+    The chord along such a line adds nothing to them.
+    """
+    later = np.roll(points, -1, -2)
+    height, next_height = ((p * normal[:, None]).sum(-1) for p in (points, later))
+    ahead, next_ahead = height >= 0, next_height >= 0
+    crosses = height / np.where(ahead == next_ahead, 1.0, height - next_height)
+    start = np.where(ahead, 0.0, np.where(next_ahead, crosses, 1.0))[..., None]
+    end = np.where(next_ahead, 1.0, np.where(ahead, crosses, start[..., 0]))[..., None]
+    return segment_sums(points + start * (later - points), points + end * (later - points))
+
+
 def polygon_sums(points: Float[np.ndarray, "*grid corners 2"]) -> Float[np.ndarray, "*grid 3"]:
     """Integrals of 1, x and y over polygons, positive for those that turn from x towards y (Green's theorem)."""
-    x, y = np.ascontiguousarray(points[..., 0]), np.ascontiguousarray(points[..., 1])
-    later_x, later_y = (np.concatenate([a[..., 1:], a[..., :1]], -1) for a in (x, y))
+    return segment_sums(points, np.concatenate([points[..., 1:, :], points[..., :1, :]], -2))
+
+
+def segment_sums(
+    start: Float[np.ndarray, "*grid corners 2"], end: Float[np.ndarray, "*grid corners 2"]
+) -> Float[np.ndarray, "*grid 3"]:
+    """What sides add to the integrals of 1, x and y over polygons."""
+    (x, later_x), (y, later_y) = ([np.ascontiguousarray(p[..., k]) for p in (start, end)] for k in range(2))
     cross = x * later_y - later_x * y
     first = [np.einsum("...i,...i->...", a, cross) / 6 for a in (x + later_x, y + later_y)]
     return np.stack([cross.sum(-1) / 2, *first], -1)

@@ -75,7 +75,7 @@ def test_how_far_it_is_drawn_is_not_known_for_each_object_by_itself():
     observation = clip_of(ROLLING, SHOWS, None)
     clip, fit = fitted(observation)
     told = clip.predictor(clip.poses(fit.hypothesis, fit.z[None]), fit.hypothesis.batch(fit.z[None]))
-    rows = uncertain(clip.measured, told.parts)
+    rows = uncertain(clip.measured, told.flow, told.whole)
     assert len(rows.flow) == len(WHOLE) + len(WITHIN)
     assert not rows.reach.any()
     assert not rows.moments.any()

@@ -106,5 +106,5 @@ def test_outlines_along_a_gap_are_not_measured():
     below, above = 4, 12
     assert np.isnan(measured.reach[-1, 1, below])
     assert np.isfinite(measured.reach[-1, 1, above])
-    assert np.isnan(measured.moments[-1]).all()
+    assert np.isnan(measured.whole[-1]).all()
     assert measured.reach.shape[2] == 16

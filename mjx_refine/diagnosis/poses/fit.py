@@ -135,7 +135,7 @@ class PosesPredictor:
         off = rotation_vector(rotations.multiply(turn, rotations.conjugate(self.quaternion)))
         count, times, objects = position.shape[:3]
         flow, beside = np.zeros((count, times - 1, objects, 1, 2)), np.zeros((count, times - 1, 1, 2))
-        return Prediction(off, flow, position, beside, bad)
+        return Prediction(off, flow, position, beside, bad, position)
 
 
 class PosesFit(ClipFit):

@@ -1,0 +1,91 @@
+"""Masks that others or the picture's border cut, and what is predicted of what is left of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mjx_refine.diagnosis.before import before_others
+from mjx_refine.diagnosis.partly import half_planes, masks_within
+from mjx_refine.view.outline import directions
+from mjx_refine.view.seen import moments_within, polygon_sums
+
+ROWS, COLUMNS = np.indices((120, 160)) + 0.5
+NEAR = 2
+
+
+def disc(x: float, y: float, radius: float) -> np.ndarray:
+    return np.hypot(COLUMNS - x, ROWS - y) <= radius
+
+
+def left_of(masks: np.ndarray, ids: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    planes = half_planes(masks, ids, NEAR, before_others(masks, ids, NEAR))
+    return planes, masks_within(masks, ids, planes)
+
+
+def predicted(x: float, y: float, radius: float, plane: np.ndarray, **more: np.ndarray) -> np.ndarray:
+    """Moments of what is left of a disc."""
+    polygon = np.array([x, y]) + radius * directions(128)
+    told = moments_within(np.array([[[[x, y, radius]]]]), plane[None, None], polygon[None, None, None], **more)
+    return told[0, 0, 0]
+
+
+@pytest.mark.parametrize("edge", [66.0, 74.0])
+def test_what_is_left_beside_a_straight_border_is_what_is_predicted(edge):
+    masks = np.where(disc(60.4, 61.3, 18), 1, 0)
+    masks[(np.abs(ROWS - 60) < 30) & (np.abs(COLUMNS - edge - 30) < 30)] = 2
+    planes, told = left_of(masks[None], (1, 2))
+    assert planes[0, 0] == pytest.approx([1.0, 0.0, edge + 0.5 - NEAR], abs=1e-6)
+    assert told[0, 0] == pytest.approx(predicted(60.4, 61.3, 18, planes[0, 0]), abs=0.06)
+    assert told[0, 0, 0] < 60.0
+
+
+def test_what_the_picture_cuts_is_known_within_it():
+    masks = np.where(disc(4.3, 50.2, 20), 1, 0)[None]
+    planes, told = left_of(masks, (1,))
+    assert planes[0, 0].tolist() == [-1.0, 0.0, -NEAR]
+    assert told[0, 0] == pytest.approx(predicted(4.3, 50.2, 20, planes[0, 0]), abs=0.1)
+    right = np.where(disc(152.0, 50.2, 20), 1, 0)[None]
+    assert left_of(right, (1,))[0][0, 0].tolist() == [1.0, 0.0, 160.0 - NEAR]
+
+
+def test_nothing_is_said_of_a_mask_that_is_whole_or_cut_on_two_sides_or_mostly_hidden():
+    whole = np.where(disc(60, 60, 18), 1, 0)[None]
+    corner = np.where(disc(4, 4, 20), 1, 0)[None]
+    assert np.isnan([left_of(one, (1,)) for one in (whole, corner)]).all()
+    hidden = whole.copy()
+    hidden[:, :, 47:110] = np.where(hidden[:, :, 47:110] + (np.abs(ROWS[:, 47:110] - 60) < 40) > 0, 2, 0)
+    assert np.isnan(left_of(np.concatenate([whole, hidden]), (1, 2))[1][1, 0]).all()
+
+
+def test_what_is_before_others_cuts_them_and_is_not_cut():
+    masks = np.where((np.abs(ROWS - 60) < 30) & (np.abs(COLUMNS - 80) < 30), 2, 0)
+    masks[disc(50, 60, 16)] = 1
+    planes, told = left_of(masks[None], (1, 2))
+    assert np.isnan(planes[0, 0]).all()
+    assert planes[0, 1] == pytest.approx([-1.0, 0.0, -65.5 - NEAR], abs=1e-6)
+    assert told[0, 1] == pytest.approx([(67.5 + 110) / 2, 60.0, np.sqrt(42.5 * 59 / np.pi)], abs=0.6)
+
+
+def test_moments_of_a_part_are_those_of_its_polygon():
+    square = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 4.0], [0.0, 4.0]])
+    area, x, y = polygon_sums(square)
+    whole = np.array([x / area, y / area, np.sqrt(area / np.pi)])[None, None, None]
+    plane = np.array([1.0, 0.0, 4.5])[None, None]
+    told = moments_within(whole, plane, square[None, None, None])[0, 0, 0]
+    assert told == pytest.approx([2.25, 2.0, np.sqrt(18 / np.pi)])
+    hidden = np.array([[4.0, 1.0], [6.0, 1.0], [6.0, 4.0], [4.0, 4.0]])
+    area, x, y = polygon_sums(square) - polygon_sums(hidden)
+    bitten = np.array([x / area, y / area, np.sqrt(area / np.pi)])[None, None, None]
+    told = moments_within(bitten, plane, square[None, None, None], hidden[None, None, None])[0, 0, 0]
+    left = 18 - 1.5
+    assert told == pytest.approx([(18 * 2.25 - 1.5 * 4.25) / left, (18 * 2 - 1.5 * 2.5) / left, np.sqrt(left / np.pi)])
+
+
+def test_moments_without_planes_stay_and_nothing_is_told_of_what_lies_beyond():
+    polygon = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 4.0], [0.0, 4.0]])
+    whole = np.array([3.0, 2.0, np.sqrt(24 / np.pi)])[None, None, None]
+    same = moments_within(whole, np.full((1, 1, 3), np.nan), polygon[None, None, None])
+    np.testing.assert_array_equal(same, whole)
+    beyond = moments_within(whole, np.array([[[1.0, 0.0, -2.0]]]), polygon[None, None, None])
+    assert np.isnan(beyond).all()
