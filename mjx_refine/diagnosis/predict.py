@@ -34,6 +34,7 @@ from mjx_refine.view.seen import (
     moments_within,
     outline_function,
     straight_pixels,
+    within_function,
 )
 
 ROWS = 8
@@ -81,10 +82,20 @@ def _plain_function(shapes: tuple[Shape, ...], arrays: Arrays, image: tuple[int,
 
 
 @functools.partial(jit_quickly, static_argnums=(0, 3, 4))
-def _predict(shapes, arrays, pixels, image, count: int):
-    """``count``: directions in which effects change outlines; 0 where none does."""
-    told = outline_function(shapes, arrays, image, count) if count else (_plain_function(shapes, arrays, image),)
-    return told, whole_function(shapes, arrays, image), point_flow_function(shapes, arrays, pixels, image)
+def _predict(shapes, arrays, pixels, image, count: int, planes=None):
+    """Outlines, moments of the whole, flow at ``pixels``, and moments of what ``planes`` leave.
+
+    ``count``: directions in which effects change outlines; 0 where none does. ``planes``: None where effects change what they
+    leave, too, or there are none.
+    """
+    whole, flow = whole_function(shapes, arrays, image), point_flow_function(shapes, arrays, pixels, image)
+    if count:
+        return outline_function(shapes, arrays, image, count), whole, flow, whole
+    told = (_plain_function(shapes, arrays, image),)
+    if planes is None:
+        return told, whole, flow, whole
+    contact = outline_function(shapes, arrays, image, min(MANY))[1]
+    return told, whole, flow, within_function(whole, planes, contact)
 
 
 class Predictor:
@@ -117,30 +128,29 @@ class Predictor:
     ):
         self.shapes, self.pixels, self.places, self.image, self.fps = shapes, pixels, places, image, fps
         self.blur, self.drawn, self.shared = blur, drawn, shared
-        self.planes = planes if planes is not None and np.isfinite(planes).any() else None
+        self.planes = None
+        if planes is not None and np.isfinite(planes).any():
+            self.planes = planes.astype(np.float32)
 
     def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Prediction:
         """The prediction for ``poses`` (of ``Simulator.rollout``) seen with the camera and effects of ``batch``."""
         bad = np.logical_not(np.isfinite(poses).all((1, 2, 3)))
         poses = np.where(bad[:, None, None, None], [0.0, 0.0, -1e3, 1.0, 0.0, 0.0, 0.0], poses)
         seen = acting.apparent(poses, batch, self.fps)
-        changes = acting.changes_outlines(batch)
-        count = directions_for(batch, DIRECTIONS) if changes else 0
-        count = count if self.planes is None else max(count, min(MANY))
+        count = directions_for(batch, DIRECTIONS) if acting.changes_outlines(batch) else 0
+        if count and self.planes is not None:
+            count = max(count, min(MANY))
         bent = straight_pixels(seen, batch, self.pixels, self.image, self.fps) if bends(batch) else None
-        told, whole, flow = self._predicted(seen, batch, self.pixels[None] if bent is None else bent[0], count)
+        told, whole, flow, within = self._predicted(seen, batch, self.pixels[None] if bent is None else bent[0], count)
         if bent is not None:
             flow = bent_flow(flow, bent[1], self.pixels, batch, self.image, self.fps)
         flow = flow[:, :-1]
-        reach, within = told[0][..., :: max(count // DIRECTIONS, 1)], whole
+        reach = told[0]
         if count:
             # Of a few rows at a time, which a core's cache holds, arrays in many directions take half as long.
             rows = [slice(first, first + CACHED) for first in range(0, len(seen), CACHED)]
-            if changes:
-                changed = [self._changed([part[one] for part in (*told, whole)], batch[one], count) for one in rows]
-                reach, whole, within = (np.concatenate(part) for part in zip(*changed, strict=True))
-            else:
-                within = np.concatenate([self._within(whole[one], told[1][one]) for one in rows])
+            changed = [self._changed([part[one] for part in (*told, whole)], batch[one], count) for one in rows]
+            reach, whole, within = (np.concatenate(part) for part in zip(*changed, strict=True))
         if self.drawn:
             flow = drawn_along(flow, whole)
         background = self._background(batch, len(poses), poses.shape[1])
@@ -165,11 +175,15 @@ class Predictor:
         change = acting.outline_change(batch, view)
         moved, hidden = changed_polygon(batch, view, change)
         whole = changed_moments(whole, view, change, moved, hidden)
-        return (reach + change)[..., :: count // DIRECTIONS], whole, self._within(whole, moved, hidden)
-
-    def _within(self, whole: np.ndarray, moved: np.ndarray, hidden: np.ndarray | None = None) -> np.ndarray:
-        """Moments of what planes leave."""
-        return whole if self.planes is None else moments_within(whole, self.planes, moved, hidden)
+        within = whole
+        if self.planes is not None:
+            # One size is compiled.
+            parts = (whole, moved) if hidden is None else (whole, moved, hidden)
+            whole_, *others = (
+                np.concatenate([p, np.repeat(p[:1], CACHED - len(p), 0)]).astype(np.float32) for p in parts
+            )
+            within = np.asarray(moments_within(whole_, self.planes, *others), np.float64)[: len(whole)]
+        return (reach + change)[..., :: count // DIRECTIONS], whole, within
 
     @functools.cached_property
     def _nearest(self) -> Int[np.ndarray, "intervals objects points"]:
@@ -189,6 +203,7 @@ class Predictor:
     def _predicted(self, seen: np.ndarray, batch: SceneBatch, pixels: np.ndarray, count: int):
         """``_predict`` of rows, ``ROWS`` at a time; ``pixels`` are one row for all, or each one's own."""
         pixels, found = pixels.astype(np.float32), []
+        planes = None if count else self.planes
         for first in range(0, len(seen), ROWS):
             rows = slice(first, min(first + ROWS, len(seen)))
             device = padded(seen[rows], batch[rows], (ROWS,))
@@ -196,7 +211,7 @@ class Predictor:
             own = pixels[rows] if len(pixels) == len(seen) else pixels
             own = np.concatenate([own, np.repeat(own[:1], ROWS - len(own), 0)])
             # What follows is prepared while this is computed.
-            found.append((rows.stop - first, _predict(self.shapes, device, own, self.image, count)))
+            found.append((rows.stop - first, _predict(self.shapes, device, own, self.image, count, planes)))
         parts = [jax.tree.map(lambda a, n=n: np.asarray(a, np.float64)[:n], one) for n, one in found]
         return parts[0] if len(parts) == 1 else jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
@@ -207,7 +222,9 @@ class Predictor:
             poses = np.tile([0.0, 2.0, 0.5, 1.0, 0.0, 0.0, 0.0], (ROWS, frames, count, 1))
             place, angle = np.tile([0.0, -2.0, 4.0], (ROWS, 1)), np.ones(ROWS)
             arrays = (poses, np.full((ROWS, count, 3), 0.3), place, angle, angle)
-            _predict(self.shapes, tuple(jnp.asarray(a, jnp.float32) for a in arrays), pixels, self.image, directed)
+            planes = None if directed else self.planes
+            ready = tuple(jnp.asarray(a, jnp.float32) for a in arrays)
+            _predict(self.shapes, ready, pixels, self.image, directed, planes)
 
     def _background(self, batch: SceneBatch, count: int, frames: int) -> np.ndarray:
         """Flow of what stands still, at ``places``: of the floor, or of infinity above the horizon."""

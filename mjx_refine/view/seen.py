@@ -10,7 +10,7 @@ from typing import TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from mjx_refine.batch import SceneBatch
 from mjx_refine.compile_cache import jit_quickly
@@ -106,65 +106,60 @@ def changed_moments(
     return np.where(seen[..., None], result, np.nan)
 
 
-def moments_within(
-    moments: Float[np.ndarray, "batch frames objects 3"],
-    planes: Float[np.ndarray, "frames objects 3"],
-    moved: Float[np.ndarray, "batch frames objects directions 2"],
-    hidden: Float[np.ndarray, "batch frames objects others 2"] | None = None,
-) -> Float[np.ndarray, "batch frames objects 3"]:
-    """Centroids and equivalent radii [px] of what of silhouettes lies within half planes.
+def within_function(
+    moments: Float[Array, "batch frames objects 3"],
+    planes: Float[Array, "frames objects 3"],
+    polygon: Float[Array, "batch frames objects directions 2"],
+    hidden: Float[Array, "batch frames objects others 2"] | None = None,
+) -> Float[Array, "batch frames objects 3"]:
+    """Centroids and equivalent radii [px] of what of silhouettes lies within half planes; pure.
 
     Args:
       moments: of whole silhouettes.
       planes: (normal x, normal y, offset) of n . p <= o; NaN where there is none.
-      moved: polygons of points of the silhouettes, of which what lies beyond is taken away.
+      polygon: points of the silhouettes, of which what lies beyond is taken away.
       hidden: polygons of what is hidden of them anyway.
     """
-    frames, objects = np.nonzero(np.isfinite(planes[..., 2]))
-    normal, offset = planes[frames, objects, :2], planes[frames, objects, 2]
-    origin = normal * offset[:, None]
-    whole = moments[:, frames, objects]
-    area = np.pi * whole[..., 2] ** 2
-    rest = np.concatenate([area[..., None], area[..., None] * (whole[..., :2] - origin)], -1)
-    rest = rest - _sums_beyond(moved[:, frames, objects] - origin[:, None], normal)
+    normal, offset = planes[..., :2], planes[..., 2]
+    # The point of the line that is nearest: integrals over a large picture would cancel.
+    origin = moments[..., :2] - normal * ((moments[..., :2] * normal).sum(-1) - offset)[..., None]
+    area = jnp.pi * moments[..., 2:] ** 2
+    rest = jnp.concatenate([area, area * (moments[..., :2] - origin)], -1)
+    rest = rest - _sums_beyond(polygon - origin[..., None, :], normal)
     if hidden is not None:
-        rest = rest + _sums_beyond(hidden[:, frames, objects] - origin[:, None], normal)
+        rest = rest + _sums_beyond(hidden - origin[..., None, :], normal)
     left = rest[..., :1] > LEAST_AREA
-    within = np.concatenate(
-        [rest[..., 1:] / np.where(left, rest[..., :1], 1.0) + origin, np.sqrt(np.maximum(rest[..., :1], 0.0) / np.pi)],
-        -1,
-    )
-    result = moments.copy()
-    result[:, frames, objects] = np.where(left, within, np.nan)
-    return result
+    middle = rest[..., 1:] / jnp.where(left, rest[..., :1], 1.0) + origin
+    radius = jnp.sqrt(jnp.maximum(rest[..., :1], 0.0) / jnp.pi)
+    within = jnp.where(left, jnp.concatenate([middle, radius], -1), jnp.nan)
+    return jnp.where(jnp.isfinite(planes), within, moments)
+
+
+moments_within = jit_quickly(within_function)
 
 
 def _sums_beyond(
-    points: Float[np.ndarray, "*grid corners 2"], normal: Float[np.ndarray, "lines 2"]
-) -> Float[np.ndarray, "*grid 3"]:
+    points: Float[Array, "batch frames objects corners 2"], normal: Float[Array, "frames objects 2"]
+) -> Float[Array, "batch frames objects 3"]:
     """``polygon_sums`` of the parts of convex polygons beyond lines through the origin.
 
     The chord along such a line adds nothing to them.
     """
-    later = np.roll(points, -1, -2)
-    height, next_height = ((p * normal[:, None]).sum(-1) for p in (points, later))
+    later = jnp.roll(points, -1, -2)
+    height, next_height = ((p * normal[:, :, None]).sum(-1) for p in (points, later))
     ahead, next_ahead = height >= 0, next_height >= 0
-    crosses = height / np.where(ahead == next_ahead, 1.0, height - next_height)
-    start = np.where(ahead, 0.0, np.where(next_ahead, crosses, 1.0))[..., None]
-    end = np.where(next_ahead, 1.0, np.where(ahead, crosses, start[..., 0]))[..., None]
-    return segment_sums(points + start * (later - points), points + end * (later - points))
+    crosses = height / jnp.where(ahead == next_ahead, 1.0, height - next_height)
+    start = jnp.where(ahead, 0.0, jnp.where(next_ahead, crosses, 1.0))[..., None]
+    end = jnp.where(next_ahead, 1.0, jnp.where(ahead, crosses, start[..., 0]))[..., None]
+    first, last = points + start * (later - points), points + end * (later - points)
+    cross = first[..., 0] * last[..., 1] - last[..., 0] * first[..., 1]
+    return jnp.concatenate([cross.sum(-1)[..., None] / 2, ((first + last) * cross[..., None]).sum(-2) / 6], -1)
 
 
 def polygon_sums(points: Float[np.ndarray, "*grid corners 2"]) -> Float[np.ndarray, "*grid 3"]:
     """Integrals of 1, x and y over polygons, positive for those that turn from x towards y (Green's theorem)."""
-    return segment_sums(points, np.concatenate([points[..., 1:, :], points[..., :1, :]], -2))
-
-
-def segment_sums(
-    start: Float[np.ndarray, "*grid corners 2"], end: Float[np.ndarray, "*grid corners 2"]
-) -> Float[np.ndarray, "*grid 3"]:
-    """What sides add to the integrals of 1, x and y over polygons."""
-    (x, later_x), (y, later_y) = ([np.ascontiguousarray(p[..., k]) for p in (start, end)] for k in range(2))
+    x, y = np.ascontiguousarray(points[..., 0]), np.ascontiguousarray(points[..., 1])
+    later_x, later_y = (np.concatenate([a[..., 1:], a[..., :1]], -1) for a in (x, y))
     cross = x * later_y - later_x * y
     first = [np.einsum("...i,...i->...", a, cross) / 6 for a in (x + later_x, y + later_y)]
     return np.stack([cross.sum(-1) / 2, *first], -1)

@@ -23,11 +23,16 @@ def left_of(masks: np.ndarray, ids: tuple[int, ...]) -> tuple[np.ndarray, np.nda
     return planes, masks_within(masks, ids, planes)
 
 
-def predicted(x: float, y: float, radius: float, plane: np.ndarray, **more: np.ndarray) -> np.ndarray:
+def within(moments: np.ndarray, plane: np.ndarray, *polygons: np.ndarray) -> np.ndarray:
+    """``moments_within`` of one silhouette."""
+    told = moments_within(moments[None, None, None], plane[None, None], *(p[None, None, None] for p in polygons))
+    return np.asarray(told)[0, 0, 0]
+
+
+def predicted(x: float, y: float, radius: float, plane: np.ndarray) -> np.ndarray:
     """Moments of what is left of a disc."""
     polygon = np.array([x, y]) + radius * directions(128)
-    told = moments_within(np.array([[[[x, y, radius]]]]), plane[None, None], polygon[None, None, None], **more)
-    return told[0, 0, 0]
+    return within(np.array([x, y, radius]), plane, polygon)
 
 
 @pytest.mark.parametrize("edge", [66.0, 74.0])
@@ -67,25 +72,23 @@ def test_what_is_before_others_cuts_them_and_is_not_cut():
     assert told[0, 1] == pytest.approx([(67.5 + 110) / 2, 60.0, np.sqrt(42.5 * 59 / np.pi)], abs=0.6)
 
 
+SQUARE = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 4.0], [0.0, 4.0]])
+
+
 def test_moments_of_a_part_are_those_of_its_polygon():
-    square = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 4.0], [0.0, 4.0]])
-    area, x, y = polygon_sums(square)
-    whole = np.array([x / area, y / area, np.sqrt(area / np.pi)])[None, None, None]
-    plane = np.array([1.0, 0.0, 4.5])[None, None]
-    told = moments_within(whole, plane, square[None, None, None])[0, 0, 0]
-    assert told == pytest.approx([2.25, 2.0, np.sqrt(18 / np.pi)])
+    area, x, y = polygon_sums(SQUARE)
+    plane = np.array([1.0, 0.0, 4.5])
+    told = within(np.array([x / area, y / area, np.sqrt(area / np.pi)]), plane, SQUARE)
+    assert told == pytest.approx([2.25, 2.0, np.sqrt(18 / np.pi)], rel=1e-5)
     hidden = np.array([[4.0, 1.0], [6.0, 1.0], [6.0, 4.0], [4.0, 4.0]])
-    area, x, y = polygon_sums(square) - polygon_sums(hidden)
-    bitten = np.array([x / area, y / area, np.sqrt(area / np.pi)])[None, None, None]
-    told = moments_within(bitten, plane, square[None, None, None], hidden[None, None, None])[0, 0, 0]
+    area, x, y = polygon_sums(SQUARE) - polygon_sums(hidden)
+    told = within(np.array([x / area, y / area, np.sqrt(area / np.pi)]), plane, SQUARE, hidden)
     left = 18 - 1.5
-    assert told == pytest.approx([(18 * 2.25 - 1.5 * 4.25) / left, (18 * 2 - 1.5 * 2.5) / left, np.sqrt(left / np.pi)])
+    centre = (18 * 2.25 - 1.5 * 4.25) / left, (18 * 2 - 1.5 * 2.5) / left
+    assert told == pytest.approx([*centre, np.sqrt(left / np.pi)], rel=1e-5)
 
 
 def test_moments_without_planes_stay_and_nothing_is_told_of_what_lies_beyond():
-    polygon = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 4.0], [0.0, 4.0]])
-    whole = np.array([3.0, 2.0, np.sqrt(24 / np.pi)])[None, None, None]
-    same = moments_within(whole, np.full((1, 1, 3), np.nan), polygon[None, None, None])
-    np.testing.assert_array_equal(same, whole)
-    beyond = moments_within(whole, np.array([[[1.0, 0.0, -2.0]]]), polygon[None, None, None])
-    assert np.isnan(beyond).all()
+    whole = np.array([3.0, 2.0, np.sqrt(24 / np.pi)], np.float32)
+    np.testing.assert_array_equal(within(whole, np.full(3, np.nan), SQUARE), whole)
+    assert np.isnan(within(whole, np.array([1.0, 0.0, -2.0]), SQUARE)).all()
