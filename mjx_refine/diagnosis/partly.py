@@ -16,6 +16,10 @@ LEAST, PART = 100, 0.4
 """Pixels of a mask, and part of its largest area in the clip, that must be left within the half plane: of less, the border's
 noise moves the centroid by more than it does a whole mask's."""
 
+STAYS = 0.85
+"""A line keeps its direction from frame to frame as long as it leaves this part of what the best one leaves: what is off smoothly
+should stay so."""
+
 
 def half_planes(
     masks: Int[np.ndarray, "frames height width"], ids: tuple[int, ...], near: int, before: Before
@@ -27,22 +31,31 @@ def half_planes(
     """
     planes = np.full((len(masks), len(ids), 3), np.nan)
     most = [max((int(np.count_nonzero(frame == i)) for frame in masks), default=0) for i in ids]
+    last: dict[int, np.ndarray] = {}
     for t, frame in enumerate(masks):
-        near_by = neighbours(frame, ids, near)
+        near_by, drawn = neighbours(frame, ids, near), last
+        last = {}
         for j, i in enumerate(ids):
             if before.whole[t, j] or not (frame == i).any():
                 continue
             others = [other for one, other in near_by if one == i and (i, other) not in before.ahead[t]]
-            found = _half_plane(frame == i, np.isin(frame, others), near)
+            found = _half_plane(frame == i, np.isin(frame, others), near, drawn.get(i))
             if found is not None and found[1] >= max(LEAST, PART * most[j]):
                 planes[t, j] = found[0]
+                last[i] = found[0][:2]
     return planes
 
 
 def _half_plane(
-    mask: Bool[np.ndarray, "height width"], others: Bool[np.ndarray, "height width"], near: int
+    mask: Bool[np.ndarray, "height width"],
+    others: Bool[np.ndarray, "height width"],
+    near: int,
+    last: Float[np.ndarray, "2"] | None,
 ) -> tuple[Float[np.ndarray, "3"], int] | None:
-    """The half plane that leaves most of a mask, and how many pixels; None where nothing cuts it, or borders on two sides."""
+    """The half plane that leaves most of a mask, and how many pixels; None where nothing cuts it, or borders on two sides.
+
+    ``last``: the normal that was drawn in the frame before, if any; nearly as good is good enough for it.
+    """
     points = np.argwhere(mask)[:, ::-1] + 0.5
     low, high = points.min(0) - near, np.array(mask.shape[::-1]) - near - points.max(0)
     cut = [np.array(n) for n, gap in zip(((-1, 0), (0, -1), (1, 0), (0, 1)), (*low, *high), strict=True) if gap < 0]
@@ -57,6 +70,9 @@ def _half_plane(
         offset = np.minimum(offset, ((np.argwhere(edge)[:, ::-1] + 0.5) @ normals.T).min(0) - near)
     left = (points @ normals.T <= offset).sum(0)
     best = int(left.argmax())
+    if last is not None:
+        same = int((normals @ last).argmax())
+        best = same if normals[same] @ last > 1 - 1e-9 and left[same] >= STAYS * left[best] else best
     return np.array([*normals[best], offset[best]]), int(left[best])
 
 

@@ -63,6 +63,17 @@ def test_nothing_is_said_of_a_mask_that_is_whole_or_cut_on_two_sides_or_mostly_h
     assert np.isnan(left_of(np.concatenate([whole, hidden]), (1, 2))[1][1, 0]).all()
 
 
+def test_a_line_keeps_its_direction_while_that_leaves_nearly_as_much():
+    masks = np.stack([np.where(disc(80, 60, 20), 1, 0)] * 4)
+    for frame, angle in zip(masks, np.deg2rad([0.0, 6.0, 12.0, 90.0]), strict=True):
+        # What hides it goes around it.
+        frame[disc(80, 60, 24) & ((COLUMNS - 80) * np.cos(angle) + (ROWS - 60) * np.sin(angle) > 10)] = 2
+    planes = left_of(masks, (1, 2))[0][:, 0]
+    assert planes[:3, :2] == pytest.approx(np.tile([1.0, 0.0], (3, 1)))
+    assert planes[3, :2] == pytest.approx([0.0, 1.0], abs=1e-9)
+    assert left_of(masks[2:], (1, 2))[0][0, 0, 1] > 0.1
+
+
 def test_what_is_before_others_cuts_them_and_is_not_cut():
     masks = np.where((np.abs(ROWS - 60) < 30) & (np.abs(COLUMNS - 80) < 30), 2, 0)
     masks[disc(50, 60, 16)] = 1
