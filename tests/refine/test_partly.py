@@ -65,7 +65,7 @@ def test_nothing_is_said_of_a_mask_that_is_whole_or_cut_on_two_sides_or_mostly_h
 
 def test_a_line_keeps_its_direction_while_that_leaves_nearly_as_much():
     masks = np.stack([np.where(disc(80, 60, 20), 1, 0)] * 4)
-    for frame, angle in zip(masks, np.deg2rad([0.0, 6.0, 12.0, 90.0]), strict=True):
+    for frame, angle in zip(masks, np.deg2rad([0.0, 5.0, 9.0, 90.0]), strict=True):
         # What hides it goes around it.
         frame[disc(80, 60, 24) & ((COLUMNS - 80) * np.cos(angle) + (ROWS - 60) * np.sin(angle) > 10)] = 2
     planes = left_of(masks, (1, 2))[0][:, 0]
