@@ -72,17 +72,7 @@ def _foretold(path: Path, key: dict[str, Any], scene: Scene) -> Foretold:
     # The exam's objects stand on its tilted floor as the key's do on a level one.
     batch = on_the_floor(batch_with_effects([scene]))
     poses = MujocoSimulator(scene.shapes, seen.fps, 1).rollout(batch, seen.length)
-    predictor = Predictor(
-        scene.shapes,
-        measured.pixels,
-        measured.places,
-        seen.size,
-        seen.fps,
-        measured.blur,
-        measured.drawn,
-        measured.shared,
-    )
-    told = predictor(poses, batch)
+    told = Predictor.of(measured, scene.shapes, seen.size, seen.fps)(poses, batch)
     moments = (measured.moments - told.moments[0])[:FIRST]
     flow = (measured.flow - told.flow[0])[:FIRST]
     off = np.linalg.norm(moments[..., :2], axis=-1)

@@ -53,8 +53,7 @@ class ClipFit:
     ):
         self.simulator, self.measured, self.image, self.frames = simulator, measured, image, frames
         self.noise = noise or everywhere(measured, frames)
-        m, shapes, fps = measured, simulator.shapes, simulator.fps
-        self.predictor = Predictor(shapes, m.pixels, m.places, image, fps, m.blur, m.drawn, m.shared, m.planes)
+        self.predictor = Predictor.of(measured, simulator.shapes, image, simulator.fps)
         self.rollouts, self.counts, self.slackness = 0.0, Counts(), 1.0
         self.store, self.crew = Store(), Crew()
         self._loose: Loose | None = None

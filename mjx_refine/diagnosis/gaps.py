@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from mjx_refine.view.moments import BESIDE
+from mjx_refine.view.outline import directions
 
 WIDEST = 24
 """Of gaps that are looked for [px]: masks are thought to be too thin by at most half of that."""
@@ -108,7 +109,8 @@ def _gaps(frame: Int[np.ndarray, "height width"], t: int) -> Iterator[_Gap]:
         part = frame[top : box[0].stop + WIDEST, left : box[1].stop + WIDEST]
         mask = part == i
         outline = _outline(mask)
-        deep = _within_hull(outline) > DEEP
+        edge = np.argwhere(outline)
+        deep = within_hull(edge, edge) > DEEP
         for other in np.unique(part[(part != 0) & (part != i)]):
             away = np.asarray(ndimage.distance_transform_edt(part != other))[outline]
             nearest = float(away.min())
@@ -120,11 +122,12 @@ def _gaps(frame: Int[np.ndarray, "height width"], t: int) -> Iterator[_Gap]:
                 yield _Gap(t, (i, int(other)), nearest, offset, int(mask.sum()), runs)
 
 
-def _within_hull(outline: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "pixels"]:
-    """How far each pixel of an outline lies within its convex hull [px]."""
-    angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    places = np.argwhere(outline) @ np.stack([np.sin(angles), np.cos(angles)])
-    return (places.max(0) - places).min(1)
+def within_hull(
+    points: Float[np.ndarray, "points 2"], of: Float[np.ndarray, "others 2"]
+) -> Float[np.ndarray, "points"]:
+    """How deep points lie within the convex hull of others [px]; negative outside."""
+    normals = directions(DIRECTIONS).T
+    return ((of @ normals).max(0) - points @ normals).min(1)
 
 
 def _evenly(away: Float[np.ndarray, "pixels"]) -> bool:

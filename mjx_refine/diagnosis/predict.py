@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from mjx_refine.batch import SceneBatch
 from mjx_refine.compile_cache import jit_quickly
 from mjx_refine.diagnosis.drawn_along import drawn_along
-from mjx_refine.diagnosis.measure import Parts
+from mjx_refine.diagnosis.measure import Measured, Parts
 from mjx_refine.effects import acting
 from mjx_refine.effects.kind import OutlineView
 from mjx_refine.scene import Shape
@@ -132,6 +132,12 @@ class Predictor:
         if planes is not None and np.isfinite(planes).any():
             self.planes = planes.astype(np.float32)
 
+    @classmethod
+    def of(cls, measured: Measured, shapes: tuple[Shape, ...], image: tuple[int, int], fps: float) -> Predictor:
+        """Of all that was measured of a clip."""
+        m = measured
+        return cls(shapes, m.pixels, m.places, image, fps, m.blur, m.drawn, m.shared, m.planes)
+
     def __call__(self, poses: Float[np.ndarray, "batch frames objects 7"], batch: SceneBatch) -> Prediction:
         """The prediction for ``poses`` (of ``Simulator.rollout``) seen with the camera and effects of ``batch``."""
         bad = np.logical_not(np.isfinite(poses).all((1, 2, 3)))
@@ -175,15 +181,16 @@ class Predictor:
         change = acting.outline_change(batch, view)
         moved, hidden = changed_polygon(batch, view, change)
         whole = changed_moments(whole, view, change, moved, hidden)
-        within = whole
-        if self.planes is not None:
-            # One size is compiled.
-            parts = (whole, moved) if hidden is None else (whole, moved, hidden)
-            whole_, *others = (
-                np.concatenate([p, np.repeat(p[:1], CACHED - len(p), 0)]).astype(np.float32) for p in parts
-            )
-            within = np.asarray(moments_within(whole_, self.planes, *others), np.float64)[: len(whole)]
-        return (reach + change)[..., :: count // DIRECTIONS], whole, within
+        return (reach + change)[..., :: count // DIRECTIONS], whole, self._within(whole, moved, hidden)
+
+    def _within(self, whole: np.ndarray, moved: np.ndarray, hidden: np.ndarray | None) -> np.ndarray:
+        """Moments of what planes leave of a few rows."""
+        if self.planes is None:
+            return whole
+        # One size is compiled.
+        rows = (whole, moved) if hidden is None else (whole, moved, hidden)
+        full = [np.concatenate([one, np.repeat(one[:1], CACHED - len(one), 0)]).astype(np.float32) for one in rows]
+        return np.asarray(moments_within(full[0], self.planes, *full[1:]), np.float64)[: len(whole)]
 
     @functools.cached_property
     def _nearest(self) -> Int[np.ndarray, "intervals objects points"]:

@@ -25,9 +25,9 @@ def misfit_map(
     """(mean square misfit by object and frame, its channel, the background's mean square misfit)."""
     parts = clip.measured.split(fit.residual)
     seen = np.isfinite(clip.measured.reach).mean(-1) > 0
-    whole = np.isfinite(clip.measured.moments).all(-1)
+    placed = np.isfinite(clip.measured.moments).all(-1)
     still = (parts.reach**2).sum(-1) + (parts.moments**2).sum(-1)
-    still = still / (clip.counts.edge + 3.0 * whole)
+    still = still / (clip.counts.edge + 3.0 * placed)
     moved = np.zeros_like(still)
     moved[:-1] = (parts.flow**2).sum((-1, -2)) / (2 * clip.counts.flow)
     total = np.where(seen, 0.6 * still + 0.4 * moved, 0.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from effect_scenes import effect
@@ -23,9 +25,11 @@ def errors(shape: str, *effects: Effect) -> tuple[np.ndarray, np.ndarray]:
     body = Body(shape, "body", SIZES[shape], (-0.95, 0.4, 0.8), turning, (2.2, 0.6, 1.8), (1.0, 2.0, 1.5))
     scene = Scene((body,), Camera((0.0, -2.0, 2.5), 50.0), effects=effects)
     seen = simulate(scene, SIZE, FRAMES)
-    measured, batch = measure(seen, (0,)), batch_with_effects([scene])
-    predictor = Predictor((shape,), measured.pixels, measured.places, SIZE, seen.fps)
-    told = predictor(MujocoSimulator((shape,), seen.fps, 1).rollout(batch, FRAMES), batch)
+    # What is drawn is the surfaces' own flow.
+    measured, batch = dataclasses.replace(measure(seen, (0,)), drawn=False), batch_with_effects([scene])
+    told = Predictor.of(measured, (shape,), SIZE, seen.fps)(
+        MujocoSimulator((shape,), seen.fps, 1).rollout(batch, FRAMES), batch
+    )
     return measured.moments[:, 0] - told.moments[0, :, 0], measured.flow[:, 0] - told.flow[0, :, 0]
 
 
@@ -69,3 +73,23 @@ def test_without_effects_one_row_of_points_serves_all():
     more = errors("sphere", effect("lens_distortion", k1=0.0))
     np.testing.assert_allclose(moments, more[0], atol=1e-3)
     np.testing.assert_allclose(flow, more[1], atol=1e-3)
+
+
+@pytest.mark.parametrize("one", [None, effect("lens_distortion", k1=0.12), effect("camera_roll", angle=4.0)])
+def test_of_what_hides_and_of_what_is_hidden_moments_are_those_of_the_picture(one):
+    turning, velocity = (0.0, 0.9239, 0.3827, 0.0), (0.3, 0.1, 1.8)
+    near = Body("sphere", "near", (0.2,), (-0.25, 0.1, 1.1), turning, velocity, (0.0, 0.0, 0.0))
+    far = Body("box", "far", (0.3, 0.25, 0.2), (0.0, 0.8, 0.6), turning, (0.1, 0.1, 1.8), (1.0, 2.0, 1.5))
+    scene = Scene((near, far), Camera((0.0, -2.0, 2.5), 50.0), effects=() if one is None else (one,))
+    seen = simulate(scene, SIZE, FRAMES)
+    measured, batch = measure(seen, (0, 1)), batch_with_effects([scene])
+    poses = MujocoSimulator(scene.shapes, seen.fps, 1).rollout(batch, FRAMES)
+    told = Predictor.of(measured, scene.shapes, SIZE, seen.fps)(poses, batch)
+    assert measured.planes is not None
+    assert np.isfinite(measured.planes[:, 1]).all(-1).sum() >= FRAMES - 2
+    assert np.isnan(measured.planes[:, 0]).all()
+    off = np.abs(measured.moments - told.moments[0])
+    assert np.isfinite(off[:, 0]).all()
+    assert (np.nanmedian(off, 0) < 0.06).all(), np.nanmedian(off, 0)
+    # What is told of the whole is something else.
+    assert np.nanmedian(np.abs(measured.moments - told.whole[0])[:, 1, :2].max(-1)) > 1.0
