@@ -32,6 +32,11 @@ without effect of seeds 19 to 35 of the withheld exams 9 and 6 % leave more in t
 65 and 58 %."""
 
 
+def leaves_much(clip: ClipFit, base: Fit) -> bool:
+    """Whether the base model leaves so much that long searches are worth their time."""
+    return clip.misfit(base) >= (LEAVES_OF_MEASURED_FLOW if clip.measured.drawn else LEAVES)
+
+
 def far_from_given(
     clip: ClipFit, base: Fit, names: list[str], view: FitView, told: Told
 ) -> list[tuple[tuple[str, int], Fit]]:
@@ -44,7 +49,7 @@ def far_from_given(
       view: what kinds need to know.
       told: called with a line where that is worth its time.
     """
-    if clip.misfit(base) < (LEAVES_OF_MEASURED_FLOW if clip.measured.drawn else LEAVES):
+    if not leaves_much(clip, base):
         return []
     told("from the given scene")
     rows = [

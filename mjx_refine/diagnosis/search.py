@@ -13,6 +13,7 @@ from mjx_refine.diagnosis.base import base_space, stored_base, with_grips
 from mjx_refine.diagnosis.candidates import Candidate, Compared, in_order, lead_of, rivals, unit_of
 from mjx_refine.diagnosis.exchange import alone, held_against
 from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.given import leaves_much
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import FIRST, FORGIVING
@@ -26,6 +27,7 @@ from mjx_refine.diagnosis.shown import view_of
 from mjx_refine.diagnosis.signs import best_candidate, structure
 from mjx_refine.diagnosis.singles import CLEAR, CLOSE, SOME_OF_IT, singles_of
 from mjx_refine.diagnosis.tempered import Shown, Told
+from mjx_refine.diagnosis.unhurried import unhurried
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 from mjx_refine.observation import Observation
@@ -102,7 +104,9 @@ def compare(
     settled = clip.settled
     shots = _shot(clip, base, (), names, scene, shown, seed, told) if video else None
     if shots is not None and _explained(clip, shots) and enough(shots):
-        return shots
+        if not (again := _taken_in(clip, base, shots, settled, names, scene, shown, seed, told)) or not enough(again):
+            return shots
+        return again
     clip.settled = settled
     base, singles, unbent = singles_of(clip, base, names, scene, shown, seed, told, video, {})
     twos: tuple[Candidate, ...] = ()
@@ -172,6 +176,41 @@ def _shot(
     singles = _as_found_together(clip, base, singles, pairs)
     base, singles, pairs = _begun_elsewhere(clip, base, singles, pairs, seed, told)
     return Compared(*_against_both(clip, base, plain, singles, pairs), impacts)
+
+
+def _taken_in(
+    clip: ClipFit, base: Fit, shots: Compared, settled, names, scene: Scene, shown: Shown, seed: int, told: Told
+) -> Compared | None:
+    """All hypotheses with states after impacts along the path of an effect that such states had taken in; None where none had.
+
+    With a state of its own after every impact the base model may explain a clip though something acts all along. Without such
+    states, and with more noise, effects that are fitted by stages from the given scene tell.
+
+    Args:
+      clip: residuals; noise is as it was where None is told.
+      base: the base model's fit without such states.
+      shots: what was found with them.
+      settled: noise as the base model left it.
+      names: of the catalogue.
+      scene: the given one.
+      shown: what a fit shows to those who look for a start.
+      seed: of what is drawn.
+      told: called with a line for each step.
+    """
+    if shots.candidates and shots.candidates[0].lead > CLEAR:
+        return None
+    after, clip.settled = clip.settled, settled
+    found: tuple[Candidate, ...] = ()
+    if leaves_much(clip, base):
+        base, ended = unhurried(clip, base, names, shown(base), told)
+        found = in_order(clip, [Candidate(fit, lead_of(fit, base), 0.0) for _, fit in ended])
+    again = None
+    if found and found[0].lead > CLEAR:
+        again = _shot(clip, base, found, names, scene, shown, seed, told)
+    if again is None or not again.candidates or again.candidates[0].lead <= CLEAR:
+        clip.settled = after
+        return None
+    return again
 
 
 def _against_both(

@@ -9,7 +9,7 @@ import numpy as np
 from mjx_refine.diagnosis.candidates import Candidate, in_order, lead_of, leans_on, unit_of
 from mjx_refine.diagnosis.exchange import Fitted, Key, at_least_nothing, exchanged
 from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
-from mjx_refine.diagnosis.given import far_from_given
+from mjx_refine.diagnosis.given import far_from_given, leaves_much
 from mjx_refine.diagnosis.knock import knocked, to_the_end
 from mjx_refine.diagnosis.leads import FORGIVING, begun, chosen_of
 from mjx_refine.diagnosis.patches import patches_from_pushes
@@ -17,6 +17,7 @@ from mjx_refine.diagnosis.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.scattered import scattered
 from mjx_refine.diagnosis.screen import Lead, Screen
 from mjx_refine.diagnosis.tempered import Shown, Told, annealed
+from mjx_refine.diagnosis.unhurried import unhurried
 from mjx_refine.diagnosis.walls import walls_from_pushes
 from mjx_refine.effects.kind import FitView
 from mjx_refine.scene import Scene
@@ -89,9 +90,14 @@ def singles_of(
             # The base model's fit has bent its parameters towards the effect; from the given scene the way is straight.
             rows += [(base, lead, SCALE) for lead in ahead.away(names)]
             if video and not shots:
+                much = leaves_much(clip, base)
                 base, ended, unbent = annealed(clip, base, names, shown, seed, told, lambda lead: words(lead, scene))
                 for lead, fit in ended:
                     _keep(clip, fitted, (lead.name, lead.target), fit, lead.gain)
+                if much:
+                    base, found = unhurried(clip, base, names, view, told)
+                    for key, fit in found:
+                        _keep(clip, fitted, key, fit, 0.0)
                 for key, fit in far_from_given(clip, base, names, view, told):
                     _keep(clip, fitted, key, fit, 0.0)
             elif not video:

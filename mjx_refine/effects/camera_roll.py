@@ -16,6 +16,7 @@ class CameraRoll(EffectKind):
     experiment = "Film a plumb line: it shows the roll; a ball at rest that stays so says that the floor is level."
     channel = "camera"
     imitated = True
+    steady = True
     parameters = (EffectParameter("angle", "degree", 4.0, -180.0, 180.0),)
 
     def camera(self, frames: int, fps: float, values: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

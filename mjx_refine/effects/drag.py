@@ -16,6 +16,7 @@ class Drag(EffectKind):
     experiment = "Film {target} at twice the speed, and once nearly still: drag grows with speed, wind does not."
     targeted = True
     physical = True
+    steady = True
     parameters = (
         EffectParameter("linear", "N s/m", 0.3, 0.0, 1e4),
         EffectParameter("quadratic", "N s^2/m^2", 0.1, 0.0, 1e4),

@@ -198,6 +198,7 @@ class EffectKind:
       strikes: whether it acts as impacts with something unseen, whose impulse nobody knows well.
       drawn: whether it changes outlines (``outline``) or the picture (``warp``).
       imitated: whether ordinary parameters can imitate much of it, so that its fit begins with much of it as well.
+      steady: whether it acts all along, so that a clip's first frames already show it.
       parameters: its numbers.
     """
 
@@ -211,6 +212,7 @@ class EffectKind:
     strikes: ClassVar[bool] = False
     drawn: ClassVar[bool] = False
     imitated: ClassVar[bool] = False
+    steady: ClassVar[bool] = False
     parameters: ClassVar[tuple[EffectParameter, ...]]
 
     # --- in the rollout -------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ class LensDistortion(EffectKind):
     channel = "camera"
     drawn = True
     imitated = True
+    steady = True
     parameters = (EffectParameter("k1", "1", 0.15, -1.0, 3.0),)
 
     def warp(self, points: np.ndarray, focal: np.ndarray, image: tuple[int, int], values: np.ndarray):

@@ -17,6 +17,7 @@ class Magnus(EffectKind):
     targeted = True
     physical = True
     imitated = True
+    steady = True
     parameters = (EffectParameter("coefficient", "kg", 0.05, -1e3, 1e3),)
 
     def loads(self, motion: Motion, target: int, values: np.ndarray) -> Loads | None:

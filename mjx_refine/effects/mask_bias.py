@@ -28,6 +28,7 @@ class MaskBias(EffectKind):
     channel = "perception"
     drawn = True
     imitated = True
+    steady = True
     parameters = (EffectParameter("width", "px", 2.0, -100.0, 100.0),)
 
     def outline(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:

@@ -18,6 +18,7 @@ class OffsetCom(EffectKind):
     channel = "rotation"
     physical = True
     imitated = True
+    steady = True
     parameters = tuple(EffectParameter(axis, "m", 0.05, -1e2, 1e2) for axis in "xyz")
 
     def centre_of_mass(self, batch: SceneBatch, target: int, values: np.ndarray) -> np.ndarray | None:

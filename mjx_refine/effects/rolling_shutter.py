@@ -19,6 +19,7 @@ class RollingShutter(EffectKind):
     channel = "timing"
     drawn = True
     imitated = True
+    steady = True
     parameters = (EffectParameter("readout", "s", 0.012, -0.2, 0.2),)
 
     def moved(self, view: OutlineView, target: int, values: np.ndarray) -> np.ndarray | None:

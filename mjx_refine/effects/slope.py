@@ -18,6 +18,7 @@ class Slope(EffectKind):
     )
     physical = True
     imitated = True
+    steady = True
     parameters = (EffectParameter("x", "degree", 4.0, -60.0, 60.0), EffectParameter("y", "degree", 4.0, -60.0, 60.0))
 
     def floor(self, values: np.ndarray) -> np.ndarray | None:

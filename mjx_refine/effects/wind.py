@@ -29,6 +29,7 @@ class Wind(EffectKind):
     sentence = "moving air pushes everything one way"
     experiment = "Film a body at rest on the floor, and one in flight: wind pushes both, a slope only what lies on it."
     physical = True
+    steady = True
     parameters = (
         EffectParameter("x", "Pa", 10.0, -1e5, 1e5),
         EffectParameter("y", "Pa", 10.0, -1e5, 1e5),
