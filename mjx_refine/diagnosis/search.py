@@ -104,9 +104,12 @@ def compare(
     settled = clip.settled
     shots = _shot(clip, base, (), names, scene, shown, seed, told) if video else None
     if shots is not None and _explained(clip, shots) and enough(shots):
-        if not (again := _taken_in(clip, base, shots, settled, names, scene, shown, seed, told)) or not enough(again):
-            return shots
-        return again
+        after, clip.settled = clip.settled, settled
+        again = _taken_in(clip, base, shots, names, scene, shown, seed, told)
+        if again is not None and enough(again):
+            return again
+        clip.settled = after
+        return shots
     clip.settled = settled
     base, singles, unbent = singles_of(clip, base, names, scene, shown, seed, told, video, {})
     twos: tuple[Candidate, ...] = ()
@@ -179,7 +182,7 @@ def _shot(
 
 
 def _taken_in(
-    clip: ClipFit, base: Fit, shots: Compared, settled, names, scene: Scene, shown: Shown, seed: int, told: Told
+    clip: ClipFit, base: Fit, shots: Compared, names, scene: Scene, shown: Shown, seed: int, told: Told
 ) -> Compared | None:
     """All hypotheses with states after impacts along the path of an effect that such states had taken in; None where none had.
 
@@ -187,30 +190,23 @@ def _taken_in(
     states, and with more noise, effects that are fitted by stages from the given scene tell.
 
     Args:
-      clip: residuals; noise is as it was where None is told.
-      base: the base model's fit without such states.
+      clip: residuals; noise as the base model left it without such states.
+      base: the base model's fit without them.
       shots: what was found with them.
-      settled: noise as the base model left it.
       names: of the catalogue.
       scene: the given one.
       shown: what a fit shows to those who look for a start.
       seed: of what is drawn.
       told: called with a line for each step.
     """
-    if shots.candidates and shots.candidates[0].lead > CLEAR:
+    if (shots.candidates and shots.candidates[0].lead > CLEAR) or not leaves_much(clip, base):
         return None
-    after, clip.settled = clip.settled, settled
-    found: tuple[Candidate, ...] = ()
-    if leaves_much(clip, base):
-        base, ended = unhurried(clip, base, names, shown(base), told)
-        found = in_order(clip, [Candidate(fit, lead_of(fit, base), 0.0) for _, fit in ended])
-    again = None
-    if found and found[0].lead > CLEAR:
-        again = _shot(clip, base, found, names, scene, shown, seed, told)
-    if again is None or not again.candidates or again.candidates[0].lead <= CLEAR:
-        clip.settled = after
+    base, ended = unhurried(clip, base, names, shown(base), told)
+    found = in_order(clip, [Candidate(fit, lead_of(fit, base), 0.0) for _, fit in ended])
+    if not found or found[0].lead <= CLEAR:
         return None
-    return again
+    again = _shot(clip, base, found, names, scene, shown, seed, told)
+    return again if again and again.candidates and again.candidates[0].lead > CLEAR else None
 
 
 def _against_both(
