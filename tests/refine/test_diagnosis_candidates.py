@@ -292,7 +292,7 @@ def test_what_is_explained_but_gives_no_answer_is_looked_into_further(monkeypatc
     def further(*rest):
         raise StopIteration
 
-    for name, value in (("_shot", shots), ("_explained", True), ("_of_own_contacts", fit)):
+    for name, value in (("_shot", shots), ("_explained", True), ("_of_own_contacts", fit), ("_taken_in", None)):
         monkeypatch.setattr(search, name, lambda *a, value=value: value)
     monkeypatch.setattr(search, "stored_base", lambda *a: fit)
     monkeypatch.setattr(search, "base_space", lambda scene: None)
