@@ -12,7 +12,7 @@ from mjx_refine.diagnosis.fit import ClipFit, Fit
 from mjx_refine.diagnosis.hypothesis import Hypothesis
 from mjx_refine.diagnosis.knock import knocked
 from mjx_refine.diagnosis.leads import FORGIVING
-from mjx_refine.diagnosis.screen import term_of
+from mjx_refine.diagnosis.screen import families_of, term_of
 from mjx_refine.diagnosis.tempered import Told, cooled
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
@@ -54,9 +54,7 @@ def far_from_given(
     told("from the given scene")
     rows = [
         (base.hypothesis, view, name, target, k, width)
-        for name in names
-        if catalogue()[name].imitated
-        for target in (range(len(view.batch.shapes)) if catalogue()[name].targeted else (-1,))
+        for name, target in families_of([name for name in names if catalogue()[name].imitated], view)
         for k, _ in catalogue()[name].still(view, target).columns
         for width in WIDTHS
     ]

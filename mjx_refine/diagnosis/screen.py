@@ -53,6 +53,12 @@ class Lead:
         return full[one.free]
 
 
+def families_of(names: list[str], view: FitView) -> list[tuple[str, int]]:
+    """Every effect with each of its targets; -1: it has no single one."""
+    targets = range(len(view.batch.shapes))
+    return [(name, target) for name in names for target in (targets if catalogue()[name].targeted else (-1,))]
+
+
 def term_of(name: str, target: int, start: Start, frames: int) -> Term:
     """The term of a start."""
     one = term(name, target, frames, start.values)
@@ -98,9 +104,7 @@ class Screen:
 
     def _rows(self, names: list[str]) -> list[tuple]:
         """What a process needs to look ahead, for every effect and target."""
-        targets = range(len(self.view.batch.shapes))
-        families = [(name, t) for name in names for t in (targets if catalogue()[name].targeted else (-1,))]
-        return [(self.fit, self.view, self.scale, self.poses, *family) for family in families]
+        return [(self.fit, self.view, self.scale, self.poses, *family) for family in families_of(names, self.view)]
 
     def far(self, kind: EffectKind, target: int) -> Lead:
         """The most promising of some widths of every parameter of one effect and target."""

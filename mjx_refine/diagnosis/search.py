@@ -199,14 +199,20 @@ def _taken_in(
       seed: of what is drawn.
       told: called with a line for each step.
     """
-    if (shots.candidates and shots.candidates[0].lead > CLEAR) or not leaves_much(clip, base):
+    if _leads(shots) or not leaves_much(clip, base):
         return None
     base, ended = unhurried(clip, base, names, shown(base), told)
     found = in_order(clip, [Candidate(fit, lead_of(fit, base), 0.0) for _, fit in ended])
     if not found or found[0].lead <= CLEAR:
         return None
     again = _shot(clip, base, found, names, scene, shown, seed, told)
-    return again if again and again.candidates and again.candidates[0].lead > CLEAR else None
+    return again if again and _leads(again) else None
+
+
+def _leads(compared: Compared) -> bool:
+    """Whether something leads by enough to go on with it."""
+    best = best_candidate(compared)
+    return best is not None and best.lead > CLEAR
 
 
 def _against_both(

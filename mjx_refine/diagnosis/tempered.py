@@ -70,7 +70,7 @@ def annealed(
     """
     plain = dataclasses.replace(base.hypothesis, slack=None)
     with tempered(clip, WARM):
-        at_once, by_stages = clip.crew.each(clip, _ground, [(plain, False), (plain, True)])
+        at_once, by_stages = clip.crew.each(clip, from_given, [(plain, False), (plain, True)])
         jagged = by_stages.cost < JAGGED * at_once.cost
         ground = min(by_stages, at_once, key=lambda fit: fit.cost)
         ahead = Screen(clip, ground, shown(ground))
@@ -100,7 +100,7 @@ def annealed(
         # The base model goes the same way: else an effect would lead that has only found better ordinary numbers.
         ground, *fits = clip.crew.each(clip, _roamed, [(ground, seed), *((fit, seed) for _, fit in found[:ROAMING])])
     unbent = [*fits, *(fit for _, fit in found[ROAMING:])]
-    ground, *fits = clip.crew.each(clip, _last, [(fit, base.cost) for fit in [ground, *unbent]])
+    ground, *fits = clip.crew.each(clip, to_the_noise, [(fit, base.cost) for fit in [ground, *unbent]])
     ended = [(lead, fit) for (lead, _), fit in zip(found, fits, strict=True)]
     best = max(base, ground, key=lambda fit: fit.evidence)
     return best, ended, sorted(unbent, key=lambda fit: fit.cost)
@@ -160,7 +160,8 @@ def _of_their_families(found: list[tuple[Lead, Fit]]) -> list[tuple[Lead, Fit]]:
     return list(best.values())
 
 
-def _ground(clip: ClipFit, plain: Hypothesis, by_stages: bool) -> Fit:
+def from_given(clip: ClipFit, plain: Hypothesis, by_stages: bool) -> Fit:
+    """The fit that begins at the given scene, by stages or at once."""
     start = np.zeros(plain.dimension)
     return staged(clip, plain, start) if by_stages else clip.fit(plain, start, GROUND)
 
@@ -184,5 +185,6 @@ def _roamed(clip: ClipFit, fit: Fit, seed: int) -> Fit:
     return clip.roam(fit, seed, ROAMED_AGAIN)
 
 
-def _last(clip: ClipFit, fit: Fit, rival: float) -> Fit:
+def to_the_noise(clip: ClipFit, fit: Fit, rival: float = np.inf) -> Fit:
+    """The fit with the noise as it is; given up where it costs far more than ``rival``."""
     return knocked(clip, clip.fit(cooled(clip, fit), fit.z, LAST, rival=rival), rival)

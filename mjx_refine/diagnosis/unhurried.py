@@ -9,15 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
-
 from mjx_refine.diagnosis.exchange import Key
 from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.knock import knocked
-from mjx_refine.diagnosis.screen import term_of
-from mjx_refine.diagnosis.staged import staged
-from mjx_refine.diagnosis.tempered import COOLER, LAST, Told, cooled, tempered
+from mjx_refine.diagnosis.screen import families_of, term_of
+from mjx_refine.diagnosis.tempered import COOLER, Told, from_given, tempered, to_the_noise
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 
@@ -42,27 +37,14 @@ def unhurried(
     """
     told("from the given scene, by stages")
     plain = dataclasses.replace(base.hypothesis, slack=None)
-    keys = [
-        (name, target)
-        for name in names
-        if catalogue()[name].steady
-        for target in (range(len(view.batch.shapes)) if catalogue()[name].targeted else (-1,))
-    ]
+    keys = families_of([name for name in names if catalogue()[name].steady], view)
     hypotheses = [
         plain,
         *(plain.added(term_of(*key, catalogue()[key[0]].still(view, key[1]), clip.frames)) for key in keys),
     ]
     with tempered(clip, COOLER):
-        ground, *fits = clip.crew.each(clip, _slowly, [(one,) for one in hypotheses])
+        ground, *fits = clip.crew.each(clip, from_given, [(one, True) for one in hypotheses])
     found = sorted(zip(keys, fits, strict=True), key=lambda one: one[1].cost)[:END]
-    ground, *fits = clip.crew.each(clip, _last, [(ground,), *((fit,) for _, fit in found)])
+    ground, *fits = clip.crew.each(clip, to_the_noise, [(ground,), *((fit,) for _, fit in found)])
     best = max(base, ground, key=lambda fit: fit.evidence)
     return best, [(key, fit) for (key, _), fit in zip(found, fits, strict=True)]
-
-
-def _slowly(clip: ClipFit, hypothesis: Hypothesis) -> Fit:
-    return staged(clip, hypothesis, np.zeros(hypothesis.dimension))
-
-
-def _last(clip: ClipFit, fit: Fit) -> Fit:
-    return knocked(clip, clip.fit(cooled(clip, fit), fit.z, LAST))

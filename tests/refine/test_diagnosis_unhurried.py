@@ -113,8 +113,7 @@ def test_noise_is_as_it_was_where_what_was_taken_in_gives_no_answer(rolled, monk
         monkeypatch.setattr(clip, name, lambda *a: 0)
     monkeypatch.setattr(clip, "fit", lambda *a: base)
     monkeypatch.setattr(clip, "roam", lambda *a: base)
-    enough = lambda compared: compared is first or answers  # noqa: E731
-    told = search.compare(clip, FLIGHT, None, (0,), (), 0, quiet, enough=enough)
+    told = search.compare(clip, FLIGHT, None, (0,), (), 0, quiet, enough=lambda compared: compared is first or answers)
     assert told is (second if answers else first)
     assert clip.settled.noise is noises[answers]
     clip.settled = kept

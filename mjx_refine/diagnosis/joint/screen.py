@@ -10,7 +10,7 @@ from jaxtyping import Float
 from mjx_refine.diagnosis.fit import SCALE
 from mjx_refine.diagnosis.joint.arrow import Arrow
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
-from mjx_refine.diagnosis.screen import Lead, Screen, distinct
+from mjx_refine.diagnosis.screen import Lead, Screen, distinct, families_of
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import EffectKind, FitView, Start
 
@@ -39,10 +39,8 @@ class JointScreen:
     def leads(self, names: list[str]) -> list[Lead]:
         """The best few starts of every effect and target, most promising first; their ``shift`` is of joint coordinates."""
         found: list[Lead] = []
-        for name in names:
-            kind = catalogue()[name]
-            for target in range(len(self.views[0].batch.shapes)) if kind.targeted else (-1,):
-                found += self._family(kind, target)
+        for name, target in families_of(names, self.views[0]):
+            found += self._family(catalogue()[name], target)
         return sorted(found, key=lambda lead: -lead.gain)
 
     def _family(self, kind: EffectKind, target: int) -> list[Lead]:
