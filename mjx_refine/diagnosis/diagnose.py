@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 
 import jax
 import numpy as np
-from mjx_fitness import UNMATCHED
 
 from mjx_refine.children import cores
 from mjx_refine.compile_cache import enable_cache
@@ -140,8 +139,7 @@ def _overlap(start: Start, observation: Observation) -> float:
     """IoU of objects with their masks, in the mean, 0 of one without; without masks, of all with what moves."""
     if observation.masks is None:
         return float(start.scores.iou[0])
-    has_mask = np.array(start.matching) != UNMATCHED
-    return float(np.where(has_mask, np.nan_to_num(start.scores.object_iou[0]), 0.0).mean())
+    return float(start.object_iou.mean())
 
 
 def _check(scene: Scene, observation: Observation) -> None:

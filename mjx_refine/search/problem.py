@@ -51,6 +51,12 @@ class Start:
     def fitness(self) -> float:
         return float(self.scores.fitness[0])
 
+    @property
+    def object_iou(self) -> Float[np.ndarray, "objects"]:
+        """IoU of each object with its own mask, 0 of one without."""
+        has_mask = np.array(self.matching) != UNMATCHED
+        return np.where(has_mask, np.nan_to_num(self.scores.object_iou[0]), 0.0)
+
 
 class Problem:
     """Samples and an observation.
