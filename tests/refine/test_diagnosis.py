@@ -20,7 +20,7 @@ from mjx_refine.diagnosis.slack import impacts, slack_of, spins
 from mjx_refine.diagnosis.verdict import (
     LIKELY,
     LIKELY_OF_A_VIDEO,
-    UNLIKELY,
+    UNLIKELY_OF_A_VIDEO,
     Answer,
     answer,
     upheld,
@@ -303,7 +303,8 @@ def test_poses_may_err_smoothly_and_more_than_their_noise_says(changes):
 )
 def test_an_answer_is_less_likely_where_something_else_gains_as_well(changes, likely):
     said = answer(changed(changes), [300.0, 150.0], video=True)
-    assert said.probability == ((LIKELY if said.kind == "unknown" else LIKELY_OF_A_VIDEO) if likely else UNLIKELY)
+    least = UNLIKELY_OF_A_VIDEO
+    assert said.probability == ((LIKELY if said.kind == "unknown" else LIKELY_OF_A_VIDEO) if likely else least)
 
 
 def test_levels_of_a_video_are_its_own_and_a_name_is_no_likelier_than_its_effect():
