@@ -18,8 +18,10 @@ from mjx_refine.diagnosis.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.signs import Signs, signs
 from mjx_refine.diagnosis.slack import impacts, slack_of, spins
 from mjx_refine.diagnosis.verdict import (
+    AT_WORK,
     LIKELY,
     LIKELY_OF_A_VIDEO,
+    UNLIKELY,
     UNLIKELY_OF_A_VIDEO,
     Answer,
     answer,
@@ -318,7 +320,8 @@ def test_levels_of_a_video_are_its_own_and_a_name_is_no_likelier_than_its_effect
     assert named.at_work >= LIKELY_OF_A_VIDEO
     assert missed.at_work < 1 - LIKELY_OF_A_VIDEO + 0.01
     less = [answer(changed({"pair": 30.0}), [300.0, 150.0], video=video) for video in (True, False)]
-    assert less[0] == less[1]
+    assert [one.probability for one in less] == [UNLIKELY_OF_A_VIDEO, UNLIKELY]
+    assert [one.at_work for one in less] == [AT_WORK["less"]] * 2
 
 
 @pytest.mark.parametrize(
