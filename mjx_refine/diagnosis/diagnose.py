@@ -19,7 +19,7 @@ from mjx_refine.diagnosis.heldout import HeldOut
 from mjx_refine.diagnosis.judged import Judged, judged
 from mjx_refine.diagnosis.knock import strike_notes
 from mjx_refine.diagnosis.measure import Measured, measure
-from mjx_refine.diagnosis.mismatch import matched, moved_by
+from mjx_refine.diagnosis.mismatch import another, matched, moved_by
 from mjx_refine.diagnosis.numbers import tied, values_at
 from mjx_refine.diagnosis.replay import Replay, replays
 from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Verdict
@@ -107,7 +107,13 @@ def _diagnosed(
     def enough(compared: Compared) -> bool:
         return judge(compared).said.kind != UNKNOWN
 
-    found = judge(compare(clip, start.scene, observation, start.matching, without, seed, told, enough=enough))
+    def hopeless(base: Fit) -> bool:
+        return observation.masks is not None and another(base)
+
+    compared = compare(
+        clip, start.scene, observation, start.matching, without, seed, told, enough=enough, another=hopeless
+    )
+    found = judge(compared)
     told("report")
     result = _result(clip, found, problem, observation, start.matching, seed, began)
     # What moves is not all that there is: without masks nobody knows what should overlap.

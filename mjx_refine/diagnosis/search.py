@@ -69,6 +69,7 @@ def compare(
     told: Told,
     begin: Callable[[], Fit] | None = None,
     enough: Callable[[Compared], bool] = lambda compared: True,
+    another: Callable[[Fit], bool] = lambda base: False,
 ) -> Compared:
     """Fits the base model, then what the linear look promises.
 
@@ -82,6 +83,7 @@ def compare(
       told: called with a line for each step.
       begin: makes the base model's first fit, where not pictures but poses were measured.
       enough: whether hypotheses that explain a clip also give an answer, so that no others need to be looked for.
+      another: whether the base model's fit tells that the scene is another clip's; then no effects are looked for.
     """
     told("base model")
     base = begin() if begin is not None else stored_base(clip, with_grips(base_space(scene)), observation, masks_of)
@@ -95,6 +97,8 @@ def compare(
     clip.allow_chaos(base, seed)
     impacts = clip.allow_slack(base)
     base = _of_own_contacts(clip, base)
+    if another(base):
+        return Compared(base, (), (), impacts)
     names = [name for name in catalogue() if name not in without]
     video = begin is None
 

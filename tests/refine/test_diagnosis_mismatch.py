@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from test_diagnose_report import made_up
+from test_diagnosis import FLIGHT, clip_of
 
+from mjx_refine.diagnosis import mismatch
+from mjx_refine.diagnosis.diagnose import diagnose
 from mjx_refine.diagnosis.mismatch import FAR, MATCHES, matched, moved_by
 from mjx_refine.diagnosis.result import UNKNOWN
 
@@ -53,3 +56,25 @@ def test_how_far_numbers_moved_is_of_the_fit_that_moves_them_least_and_of_ordina
 
     assert moved_by([fit(3.0, 4.0)]) == pytest.approx(math.sqrt(12.5))
     assert moved_by([fit(3.0, 4.0), fit(1.0, 1.0, 90.0)]) == pytest.approx(1.0)
+
+
+@pytest.fixture
+def moved_at_once(monkeypatch):
+    """Any move of ordinary numbers is that of a scene of another clip."""
+    monkeypatch.setattr(mismatch, "AT_ONCE", 0.0)
+    monkeypatch.setattr(mismatch, "FAR", 0.0)
+
+
+def test_no_effect_is_looked_for_in_a_scene_that_the_base_model_leaves_far_behind(moved_at_once):
+    lines: list[str] = []
+    found = diagnose(FLIGHT, clip_of(FLIGHT, 12), threads=1, told=lines.append)
+    assert lines == ["base model", "held-out frames", "a force without a name", "report"]
+    assert found.verdict.effects == UNKNOWN
+    assert "Cannot tell" in found.verdict.sentence
+    assert found.candidates == ()
+
+
+def test_without_masks_a_scene_is_taken_as_it_is_given(moved_at_once):
+    lines: list[str] = []
+    diagnose(FLIGHT, dataclasses.replace(clip_of(FLIGHT, 12), masks=None), threads=1, told=lines.append)
+    assert len(lines) > 4
