@@ -37,6 +37,22 @@ LAYERS = (
     {"cli"},
     {"__main__"},
 )
+# Within a part whose modules are many, likewise: a package or module of it may import those of lower layers and itself.
+INNER = {
+    "diagnosis": (
+        {"result"},
+        {"seen"},
+        {"fits"},
+        {"misfit"},
+        {"search"},
+        {"answer"},
+        {"diagnose"},
+        {"poses"},
+        {"joint"},
+        {"recorded"},
+        {"__init__"},
+    ),
+}
 # Which of the other two packages a part may import; they import nothing of ours.
 BORDERS = {"search": {"mjx_cmaes", "mjx_fitness"}, "view": {"mjx_fitness"}, "evaluate": {"mjx_fitness"}, "guess": {"mjx_fitness"},
            "report": {"mjx_fitness"}}  # fmt: skip
@@ -88,8 +104,13 @@ def imports(path: Path) -> set[str]:
 
 def part(module: str) -> str:
     """The part of mjx_refine that a module belongs to: ``mjx_refine.search.run`` -> ``search``."""
+    return inner(module, 1)
+
+
+def inner(module: str, depth: int = 2) -> str:
+    """The same within a part: ``mjx_refine.diagnosis.fits.pace`` -> ``fits``."""
     names = module.split(".")
-    return names[1] if len(names) > 1 else "__init__"
+    return names[depth] if len(names) > depth else "__init__"
 
 
 def breaches(module: str, imported: set[str]) -> list[str]:
@@ -103,6 +124,10 @@ def breaches(module: str, imported: set[str]) -> list[str]:
                 found.append(f"{module} imports {other}")
         elif package == "mjx_refine" and part(other) != part(module) and level[part(other)] >= level[part(module)]:
             found.append(f"{module} (layer {level[part(module)]}) imports {other} (layer {level[part(other)]})")
+        elif part(other) == part(module) and (layers := INNER.get(part(module))):
+            floor = {name: height for height, names in enumerate(layers) for name in names}
+            if inner(other) != inner(module) and floor[inner(other)] >= floor[inner(module)]:
+                found.append(f"{module} (layer {floor[inner(module)]}) imports {other} (layer {floor[inner(other)]})")
     return found
 
 
@@ -115,6 +140,11 @@ def test_every_part_has_a_layer():
     assert sorted({part(module) for module in MODULES if module.startswith("mjx_refine")}) == sorted(
         set().union(*LAYERS)
     )
+
+
+@pytest.mark.parametrize("name", INNER)
+def test_every_module_of_a_layered_part_has_a_layer(name):
+    assert sorted({inner(module) for module in MODULES if part(module) == name}) == sorted(set().union(*INNER[name]))
 
 
 def circles(edges: dict[str, set[str]]) -> list[list[str]]:
@@ -147,6 +177,8 @@ def test_circles_are_found():
         ("mjx_refine.scene.read", "mjx_refine.cli"),
         ("mjx_refine.sim.c", "mjx_refine.search.options"),
         ("mjx_refine.sim.c", "mjx_refine.view.rays"),
+        ("mjx_refine.diagnosis.fits.pace", "mjx_refine.diagnosis.search.compare"),
+        ("mjx_refine.diagnosis.seen.measure", "mjx_refine.diagnosis.fits.fit"),
         ("mjx_refine.scene.read", "mjx_cmaes"),
         ("mjx_refine.guess.guess", "mjx_refine.export"),
         ("mjx_refine.search.run", "mjx_refine"),

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.withheld.answer import clips
-from mjx_refine.diagnosis.measure import measure
-from mjx_refine.diagnosis.predict import Predictor
+from mjx_refine.diagnosis.seen.measure import measure
+from mjx_refine.diagnosis.seen.predict import Predictor
 from mjx_refine.effects import batch_with_effects, catalogue
 from mjx_refine.effects.acting import on_the_floor
 from mjx_refine.observation import load_observation

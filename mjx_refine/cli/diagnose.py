@@ -16,7 +16,7 @@ import click
 from mjx_refine.errors import InputError
 
 if TYPE_CHECKING:
-    from mjx_refine.diagnosis.store import Store
+    from mjx_refine.diagnosis.fits.store import Store
 
 _PATH = click.Path(path_type=Path)
 RESULTS = ("diagnosed.yaml", "report.html", "diagnosis.json")
@@ -208,7 +208,7 @@ def unfinished(out: Path, digest: str, resume: bool) -> Store:
       digest: of the call.
       resume: whether to go on from what is there.
     """
-    from mjx_refine.diagnosis.store import Store, versions
+    from mjx_refine.diagnosis.fits.store import Store, versions
 
     folder = out / UNFINISHED
     key = hashlib.sha256(f"{digest} {versions()}".encode()).hexdigest()[:16]

@@ -11,24 +11,24 @@ import numpy as np
 
 from mjx_refine.children import cores
 from mjx_refine.compile_cache import enable_cache
-from mjx_refine.diagnosis.base import grip_notes
-from mjx_refine.diagnosis.candidates import Candidate, Compared
-from mjx_refine.diagnosis.crew import Crew, crew_of
-from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.heldout import HeldOut
-from mjx_refine.diagnosis.judged import Judged, judged
-from mjx_refine.diagnosis.knock import strike_notes
-from mjx_refine.diagnosis.measure import Measured, measure
-from mjx_refine.diagnosis.mismatch import another, matched, moved_by
-from mjx_refine.diagnosis.numbers import tied, values_at
-from mjx_refine.diagnosis.replay import Replay, replays
+from mjx_refine.diagnosis.answer.judged import Judged, judged
+from mjx_refine.diagnosis.answer.mismatch import another, matched, moved_by
+from mjx_refine.diagnosis.answer.replay import Replay, replays
+from mjx_refine.diagnosis.answer.verdict import Answer
+from mjx_refine.diagnosis.fits.base import grip_notes
+from mjx_refine.diagnosis.fits.candidates import Candidate, Compared
+from mjx_refine.diagnosis.fits.crew import Crew, crew_of
+from mjx_refine.diagnosis.fits.fit import ClipFit, Fit
+from mjx_refine.diagnosis.fits.knock import strike_notes
+from mjx_refine.diagnosis.fits.numbers import tied, values_at
+from mjx_refine.diagnosis.fits.shown import view_of
+from mjx_refine.diagnosis.fits.store import Store
+from mjx_refine.diagnosis.misfit.heldout import HeldOut
+from mjx_refine.diagnosis.misfit.signs import best_candidate, map_of
+from mjx_refine.diagnosis.misfit.where import describe, misfit_map, places
 from mjx_refine.diagnosis.result import UNKNOWN, Diagnosis, Gap, Ranked, Verdict
-from mjx_refine.diagnosis.search import compare
-from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.signs import best_candidate, map_of
-from mjx_refine.diagnosis.store import Store
-from mjx_refine.diagnosis.verdict import Answer
-from mjx_refine.diagnosis.where import describe, misfit_map, places
+from mjx_refine.diagnosis.search.compare import compare
+from mjx_refine.diagnosis.seen.measure import Measured, measure
 from mjx_refine.effects.kind import FitView
 from mjx_refine.errors import InputError
 from mjx_refine.linear_algebra import one_thread

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from mjx_refine.diagnosis.fits.store import Store
 from mjx_refine.diagnosis.joint.recordings import diagnose_recordings
 from mjx_refine.diagnosis.poses import Poses, diagnose_recording
 from mjx_refine.diagnosis.result import Diagnosis
-from mjx_refine.diagnosis.store import Store
 from mjx_refine.scene import Scene
 
 

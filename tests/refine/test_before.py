@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjx_refine.diagnosis.before import before_others
-from mjx_refine.diagnosis.measure import measure
+from mjx_refine.diagnosis.seen.before import before_others
+from mjx_refine.diagnosis.seen.measure import measure
 from mjx_refine.observation import Observation
 from mjx_refine.view.moments import whole_masks
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjx_refine.diagnosis import cuts
-from mjx_refine.diagnosis.cuts import cut_places
+from mjx_refine.diagnosis.seen import cuts
+from mjx_refine.diagnosis.seen.cuts import cut_places
 
 ROWS, COLUMNS = np.mgrid[:120, :160]
 

@@ -13,19 +13,20 @@ from own_poses import BALL, CAMERA, GIVEN, SIGMA, THROW, acting, exact, recorded
 
 from mjx_refine import rotations
 from mjx_refine.cli.main import run
-from mjx_refine.diagnosis import chaos, diagnose_poses, load_poses, make_poses
-from mjx_refine.diagnosis import fit as fitting
-from mjx_refine.diagnosis.candidates import Candidate, Compared
-from mjx_refine.diagnosis.fit import ClipFit
-from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.measure import Parts
+from mjx_refine.diagnosis import diagnose_poses, load_poses, make_poses
+from mjx_refine.diagnosis.fits import chaos
+from mjx_refine.diagnosis.fits import fit as fitting
+from mjx_refine.diagnosis.fits.candidates import Candidate, Compared
+from mjx_refine.diagnosis.fits.fit import ClipFit
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.misfit.signs import Signs
 from mjx_refine.diagnosis.poses.data import noise_of, rotation_vector
 from mjx_refine.diagnosis.poses.diagnose import unsettled
 from mjx_refine.diagnosis.poses.fit import PosesFit, at_times, rate_of
 from mjx_refine.diagnosis.poses.heldout import kept_samples
 from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.diagnosis.poses.where import quiet
-from mjx_refine.diagnosis.signs import Signs
+from mjx_refine.diagnosis.seen.measure import Parts
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Body, Effect, Scene, load_scene, save_scene
 from mjx_refine.sim.c import MujocoSimulator

@@ -14,8 +14,8 @@ import pytest
 from own_clip import FLIGHT, SIZE
 
 from mjx_refine.diagnosis import diagnose
-from mjx_refine.diagnosis.crew import Crew, crew_of
-from mjx_refine.diagnosis.store import Borrowed, Store
+from mjx_refine.diagnosis.fits.crew import Crew, crew_of
+from mjx_refine.diagnosis.fits.store import Borrowed, Store
 from mjx_refine.effects import catalogue
 from mjx_refine.report.diagnosis_numbers import diagnosis_numbers
 from mjx_refine.scene import Effect
@@ -103,7 +103,7 @@ def test_fits_of_another_process_are_read_and_handed_over(tmp_path):
 
 SCRIPT = """
 import os, sys, time
-from mjx_refine.diagnosis.crew import crew_of
+from mjx_refine.diagnosis.fits.crew import crew_of
 from test_diagnose_processes import Toy, where
 
 print("begun", flush=True)

@@ -19,7 +19,7 @@ from own_poses import GIVEN, acting, recorded
 from mjx_refine.cli.diagnose import UNFINISHED, unfinished
 from mjx_refine.cli.main import run
 from mjx_refine.diagnosis import diagnose
-from mjx_refine.diagnosis.store import Store, fingerprint, versions
+from mjx_refine.diagnosis.fits.store import Store, fingerprint, versions
 from mjx_refine.report.diagnosis_numbers import diagnosis_numbers
 from mjx_refine.scene import Effect, save_scene
 from mjx_refine.simulate import simulate

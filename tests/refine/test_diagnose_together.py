@@ -12,8 +12,9 @@ from own_poses import BALL, CAMERA, GIVEN, THROW, recorded
 
 from mjx_refine.cli.main import run
 from mjx_refine.diagnosis import Poses, diagnose_poses
-from mjx_refine.diagnosis.fit import prior
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.fits.fit import prior
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.fits.pace import STEPS
 from mjx_refine.diagnosis.joint.answer import no_better_than_one
 from mjx_refine.diagnosis.joint.arrow import Arrow
 from mjx_refine.diagnosis.joint.fit import Clips
@@ -21,7 +22,6 @@ from mjx_refine.diagnosis.joint.heldout import Foretold, Outside, early_part, fo
 from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis, common_scenes, with_frozen_setup
 from mjx_refine.diagnosis.joint.recordings import Recordings
 from mjx_refine.diagnosis.joint.slack import GRID, with_slackness
-from mjx_refine.diagnosis.pace import STEPS
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Body, Effect, Scene, load_scene, save_scene
 

@@ -10,14 +10,7 @@ import pytest
 from own_clip import CAMERA, SIZE
 
 from mjx_refine.diagnosis import diagnose
-from mjx_refine.diagnosis import signs as reading
-from mjx_refine.diagnosis.diagnose import verdict_of
-from mjx_refine.diagnosis.fitted import prior
-from mjx_refine.diagnosis.heldout import HeldOut, kept_frames
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.signs import Signs, signs
-from mjx_refine.diagnosis.slack import impacts, slack_of, spins
-from mjx_refine.diagnosis.verdict import (
+from mjx_refine.diagnosis.answer.verdict import (
     AT_WORK,
     LIKELY,
     LIKELY_OF_A_VIDEO,
@@ -27,6 +20,13 @@ from mjx_refine.diagnosis.verdict import (
     answer,
     upheld,
 )
+from mjx_refine.diagnosis.diagnose import verdict_of
+from mjx_refine.diagnosis.fits.fitted import prior
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.fits.slack import impacts, slack_of, spins
+from mjx_refine.diagnosis.misfit import signs as reading
+from mjx_refine.diagnosis.misfit.heldout import HeldOut, kept_frames
+from mjx_refine.diagnosis.misfit.signs import Signs, signs
 from mjx_refine.effects import batch_with_effects, catalogue
 from mjx_refine.effects.acting import apparent
 from mjx_refine.errors import InputError

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mjx_refine.diagnosis import apart
-from mjx_refine.diagnosis.apart import beside, companies, meetings, moved_together
-from mjx_refine.diagnosis.hypothesis import WHOLE, Hypothesis, term
-from mjx_refine.diagnosis.nodes import Node, missed_by, missing
+from mjx_refine.diagnosis.fits import apart
+from mjx_refine.diagnosis.fits.apart import beside, companies, meetings, moved_together
+from mjx_refine.diagnosis.fits.hypothesis import WHOLE, Hypothesis, term
+from mjx_refine.diagnosis.fits.nodes import Node, missed_by, missing
 from mjx_refine.effects.magnus import Magnus
 from mjx_refine.scene import Body, Camera, Scene
 from mjx_refine.sim.c import MujocoSimulator

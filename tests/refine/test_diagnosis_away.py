@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from test_diagnosis import FLIGHT, clip_of
 
-from mjx_refine.diagnosis.base import base_space
 from mjx_refine.diagnosis.diagnose import prepared
-from mjx_refine.diagnosis.fit import SCALE, ClipFit
-from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.leads import beginning
-from mjx_refine.diagnosis.screen import AWAY, Screen
-from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.singles import _keep_leads
+from mjx_refine.diagnosis.fits.base import base_space
+from mjx_refine.diagnosis.fits.fit import SCALE, ClipFit
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.shown import view_of
+from mjx_refine.diagnosis.search.leads import beginning
+from mjx_refine.diagnosis.search.screen import AWAY, Screen
+from mjx_refine.diagnosis.search.singles import _keep_leads
 from mjx_refine.effects import catalogue
 from mjx_refine.scene import Effect
 

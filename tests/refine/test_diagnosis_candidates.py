@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from test_diagnosis import FLIGHT
 
-from mjx_refine.diagnosis import candidates, pairs, search, singles
-from mjx_refine.diagnosis.base import base_space
-from mjx_refine.diagnosis.candidates import (
+from mjx_refine.diagnosis.fits import candidates
+from mjx_refine.diagnosis.fits.base import base_space
+from mjx_refine.diagnosis.fits.candidates import (
     AGAINST,
     AT_IMPACT,
     DOUBT,
@@ -22,9 +22,11 @@ from mjx_refine.diagnosis.candidates import (
     in_order,
     lead_of,
 )
-from mjx_refine.diagnosis.fitted import Fit
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.walls import push_last
+from mjx_refine.diagnosis.fits.fitted import Fit
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.search.compare import compare as search
+from mjx_refine.diagnosis.search.compare import pairs, singles
+from mjx_refine.diagnosis.search.walls import push_last
 from mjx_refine.effects.push import Push
 from mjx_refine.sim.c import MujocoSimulator
 

@@ -9,10 +9,10 @@ from own_clip import CAMERA, SLIDE
 from test_diagnosis import BALL, FLIGHT, clip_of
 from test_diagnosis_replay import started
 
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.patches import patches_from_pushes
-from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.slack import contacts, impacts, sustained, touching
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.fits.shown import view_of
+from mjx_refine.diagnosis.fits.slack import contacts, impacts, sustained, touching
+from mjx_refine.diagnosis.search.patches import patches_from_pushes
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.effects.acting import on_the_floor
 from mjx_refine.scene import Effect, Scene

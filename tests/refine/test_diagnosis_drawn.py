@@ -9,13 +9,13 @@ import pytest
 from own_clip import SIZE
 from test_diagnosis import BALL, FLIGHT
 
-from mjx_refine.diagnosis.base import base_space
+from mjx_refine.diagnosis.answer.verdict import answer
 from mjx_refine.diagnosis.diagnose import prepared
-from mjx_refine.diagnosis.drawn_along import SHOWS, WHOLE, WITHIN, against, drawn_along, uncertain
-from mjx_refine.diagnosis.fit import ClipFit
-from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.signs import Signs
-from mjx_refine.diagnosis.verdict import answer
+from mjx_refine.diagnosis.fits.base import base_space
+from mjx_refine.diagnosis.fits.fit import ClipFit
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.misfit.signs import Signs
+from mjx_refine.diagnosis.seen.drawn_along import SHOWS, WHOLE, WITHIN, against, drawn_along, uncertain
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Scene

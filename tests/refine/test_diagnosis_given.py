@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from test_diagnosis_tempered import ROLL, quiet, started_with
 
-from mjx_refine.diagnosis import given
-from mjx_refine.diagnosis.given import GO_ON, far_from_given
+from mjx_refine.diagnosis.search.compare import given
+from mjx_refine.diagnosis.search.given import GO_ON, far_from_given
 
 
 @pytest.fixture(scope="module")

@@ -10,13 +10,13 @@ from own_clip import SIZE
 from test_diagnosis import BALL, FLIGHT
 
 from mjx_refine.batch import GRIP
-from mjx_refine.diagnosis.base import base_space, grip_notes, with_grips, without_grips
+from mjx_refine.diagnosis.answer.replay import replays
+from mjx_refine.diagnosis.answer.verdict import STILL, answer
 from mjx_refine.diagnosis.diagnose import prepared
-from mjx_refine.diagnosis.fit import ClipFit
-from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.replay import replays
-from mjx_refine.diagnosis.signs import Signs
-from mjx_refine.diagnosis.verdict import STILL, answer
+from mjx_refine.diagnosis.fits.base import base_space, grip_notes, with_grips, without_grips
+from mjx_refine.diagnosis.fits.fit import ClipFit
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.misfit.signs import Signs
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.observation import Observation
 from mjx_refine.sim.c import MujocoSimulator

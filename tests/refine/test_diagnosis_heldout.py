@@ -9,9 +9,9 @@ import pytest
 from test_diagnosis import FLIGHT, clip_of
 from test_diagnosis_replay import started
 
-from mjx_refine.diagnosis.common_motion import FEW, affine, similar
-from mjx_refine.diagnosis.heldout import held_out, kept_frames
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.misfit.heldout import held_out, kept_frames
+from mjx_refine.diagnosis.seen.common_motion import FEW, affine, similar
 from mjx_refine.scene import Effect
 from mjx_refine.space import Space
 

@@ -9,9 +9,9 @@ import pytest
 from test_diagnosis import FLIGHT, clip_of
 from test_diagnosis_replay import started
 
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.knock import excuses, knocked, strike_notes
-from mjx_refine.diagnosis.slack import slack_of
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.fits.knock import excuses, knocked, strike_notes
+from mjx_refine.diagnosis.fits.slack import slack_of
 from mjx_refine.scene import Effect
 from mjx_refine.space import Space
 

@@ -10,12 +10,12 @@ from test_diagnosis import clip_of
 from test_diagnosis_replay import started
 from test_shooting import BALL
 
-from mjx_refine.diagnosis.base import base_space
-from mjx_refine.diagnosis.fit import SCALE
-from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.lost import NAME, PROMISED, lost_frames
-from mjx_refine.diagnosis.shooting import base_with_nodes, with_nodes
-from mjx_refine.diagnosis.shown import view_of
+from mjx_refine.diagnosis.fits.base import base_space
+from mjx_refine.diagnosis.fits.fit import SCALE
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.shown import view_of
+from mjx_refine.diagnosis.search.lost import NAME, PROMISED, lost_frames
+from mjx_refine.diagnosis.search.shooting import base_with_nodes, with_nodes
 from mjx_refine.scene import Effect
 
 DROPPED = Effect(NAME, None, (("frame", 10), ("count", 3)))

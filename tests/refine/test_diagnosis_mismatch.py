@@ -12,9 +12,9 @@ import pytest
 from test_diagnose_report import made_up
 from test_diagnosis import FLIGHT, clip_of
 
-from mjx_refine.diagnosis import mismatch
+from mjx_refine.diagnosis.answer import mismatch
+from mjx_refine.diagnosis.answer.mismatch import FAR, MATCHES, matched, moved_by
 from mjx_refine.diagnosis.diagnose import diagnose
-from mjx_refine.diagnosis.mismatch import FAR, MATCHES, matched, moved_by
 from mjx_refine.diagnosis.result import UNKNOWN
 
 

@@ -9,9 +9,9 @@ import pytest
 from test_diagnosis import clip_of
 from test_diagnosis_replay import BOUNCE, started
 
-from mjx_refine.diagnosis.exchange import begun_again
-from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.knock import knocked
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.knock import knocked
+from mjx_refine.diagnosis.search.exchange import begun_again
 from mjx_refine.space import Space
 
 

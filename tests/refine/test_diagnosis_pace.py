@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mjx_refine.diagnosis.fits.pace import OWN, STEPS, Differences, Effort, descended
 from mjx_refine.diagnosis.joint.differences import JointDifferences
-from mjx_refine.diagnosis.pace import OWN, STEPS, Differences, Effort, descended
 
 SLOPES = np.random.default_rng(0).normal(size=(40, 3)) * [30.0, 10.0, 3.0]
 BOUNDS = np.full(3, -5.0), np.full(3, 5.0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from effect_scenes import effect
 
-from mjx_refine.diagnosis.measure import measure
-from mjx_refine.diagnosis.predict import Predictor
+from mjx_refine.diagnosis.seen.measure import measure
+from mjx_refine.diagnosis.seen.predict import Predictor
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.scene import Body, Camera, Effect, Scene
 from mjx_refine.sim.c import MujocoSimulator

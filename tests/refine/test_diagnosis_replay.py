@@ -10,11 +10,11 @@ from own_clip import SIZE
 from test_diagnosis import BALL, FLIGHT, clip_of
 
 from mjx_refine.diagnosis import diagnose
+from mjx_refine.diagnosis.answer.replay import COARSE, replays
 from mjx_refine.diagnosis.diagnose import prepared
-from mjx_refine.diagnosis.fit import ClipFit
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.replay import COARSE, replays
-from mjx_refine.diagnosis.search import compare
+from mjx_refine.diagnosis.fits.fit import ClipFit
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.search.compare import compare
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Effect, Scene
 from mjx_refine.simulate import simulate

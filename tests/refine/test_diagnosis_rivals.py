@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from test_diagnosis_candidates import candidate
 
-from mjx_refine.diagnosis import exchange, pairs, search, singles
-from mjx_refine.diagnosis.candidates import DOUBT, OUTDONE, Candidate, rivals
+from mjx_refine.diagnosis.fits.candidates import DOUBT, OUTDONE, Candidate, rivals
+from mjx_refine.diagnosis.search.compare import compare as search
+from mjx_refine.diagnosis.search.compare import exchange, pairs, singles
 
 BEST = candidate(1000.0, ("camera_shake", -1))
 NEAR = candidate(1.01 * OUTDONE * BEST.lead, ("drag", 0))

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from test_diagnosis_staged import STRUCK, clip_of, started
 
-from mjx_refine.diagnosis.base import base_space
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.scattered import scattered
-from mjx_refine.diagnosis.tempered import WARM, tempered
+from mjx_refine.diagnosis.fits.base import base_space
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.search.scattered import scattered
+from mjx_refine.diagnosis.search.tempered import WARM, tempered
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_what_others_found_for_the_ordinary_numbers_is_tried(stuck, monkeypatch)
     (best,) = scattered(clip, [fit], [], count, 0)
     biased = fit.hypothesis.added(term("mask_bias", -1, clip.frames))
     wide = clip.fit(biased, np.concatenate([fit.z, np.zeros(len(biased.bounds[0]) - count)]), 2)
-    monkeypatch.setattr("mjx_refine.diagnosis.scattered._draws", lambda *_: [])
+    monkeypatch.setattr("mjx_refine.diagnosis.search.scattered._draws", lambda *_: [])
     (without,) = scattered(clip, [wide], [], count, 0)
     (with_it,) = scattered(clip, [wide], [best], count, 0)
     assert without is wide

@@ -10,10 +10,10 @@ from own_clip import CAMERA
 from test_diagnosis import clip_of
 from test_diagnosis_replay import started
 
-from mjx_refine.diagnosis.base import base_space
-from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.staged import staged
-from mjx_refine.diagnosis.tempered import WARM, tempered
+from mjx_refine.diagnosis.fits.base import base_space
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.staged import staged
+from mjx_refine.diagnosis.search.tempered import WARM, tempered
 from mjx_refine.scene import Body, Scene
 
 STRUCK = Scene(

@@ -8,16 +8,16 @@ import pytest
 from test_diagnosis import FLIGHT, clip_of
 from test_diagnosis_replay import started
 
-from mjx_refine.diagnosis.chaos import DRAWS, EXCUSED, believed, drawn, jaggedness
-from mjx_refine.diagnosis.crew import Crew
-from mjx_refine.diagnosis.exchange import at_least_nothing, exchanged
-from mjx_refine.diagnosis.fitted import Fit
-from mjx_refine.diagnosis.hypothesis import term
-from mjx_refine.diagnosis.measure import Parts, moment_roughness
-from mjx_refine.diagnosis.noise import Counts, settled
-from mjx_refine.diagnosis.numbers import tied
-from mjx_refine.diagnosis.pace import ATTEMPTS, STEPS, Differences, Effort, damped, descended, updated
-from mjx_refine.diagnosis.roam import Strategy
+from mjx_refine.diagnosis.fits.chaos import DRAWS, EXCUSED, believed, drawn, jaggedness
+from mjx_refine.diagnosis.fits.crew import Crew
+from mjx_refine.diagnosis.fits.fitted import Fit
+from mjx_refine.diagnosis.fits.hypothesis import term
+from mjx_refine.diagnosis.fits.numbers import tied
+from mjx_refine.diagnosis.fits.pace import ATTEMPTS, STEPS, Differences, Effort, damped, descended, updated
+from mjx_refine.diagnosis.fits.roam import Strategy
+from mjx_refine.diagnosis.search.exchange import at_least_nothing, exchanged
+from mjx_refine.diagnosis.seen.measure import Parts, moment_roughness
+from mjx_refine.diagnosis.seen.noise import Counts, settled
 
 RNG = np.random.default_rng(0)
 

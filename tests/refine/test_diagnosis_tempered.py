@@ -10,13 +10,13 @@ import pytest
 from test_diagnosis import FLIGHT, clip_of
 from test_diagnosis_replay import started
 
-from mjx_refine.diagnosis.base import base_space
 from mjx_refine.diagnosis.diagnose import _unmatched
-from mjx_refine.diagnosis.hypothesis import Hypothesis
-from mjx_refine.diagnosis.leads import chosen_of
-from mjx_refine.diagnosis.screen import Screen
-from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.tempered import annealed, beside_tempered, cooled, tempered
+from mjx_refine.diagnosis.fits.base import base_space
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.shown import view_of
+from mjx_refine.diagnosis.search.leads import chosen_of
+from mjx_refine.diagnosis.search.screen import Screen
+from mjx_refine.diagnosis.search.tempered import annealed, beside_tempered, cooled, tempered
 from mjx_refine.scene import Effect
 
 WIND, ROLL = (

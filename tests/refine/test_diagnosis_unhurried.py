@@ -8,9 +8,10 @@ import pytest
 from test_diagnosis import FLIGHT
 from test_diagnosis_tempered import ROLL, quiet, started_with
 
-from mjx_refine.diagnosis import given, search
-from mjx_refine.diagnosis.candidates import Candidate, Compared
-from mjx_refine.diagnosis.unhurried import END, unhurried
+from mjx_refine.diagnosis.fits.candidates import Candidate, Compared
+from mjx_refine.diagnosis.search.compare import compare as search
+from mjx_refine.diagnosis.search.compare import given
+from mjx_refine.diagnosis.search.unhurried import END, unhurried
 from mjx_refine.effects import catalogue
 
 NAMES = ["camera_roll", "push", "dropped_frames"]

@@ -14,11 +14,11 @@ from test_diagnosis import FLIGHT, SIGNS, without_residuals
 
 from mjx_refine.batch import BatchEffect, batch_from_scenes
 from mjx_refine.diagnosis import diagnose
-from mjx_refine.diagnosis.candidates import Freed
+from mjx_refine.diagnosis.answer.verdict import UNNAMED, UNNAMED_ALONE, UNNAMED_ON_THE_FLOOR, Answer, answer
 from mjx_refine.diagnosis.diagnose import TO_THE_NOISE, verdict_of
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.signs import MOSTLY, signs
-from mjx_refine.diagnosis.verdict import UNNAMED, UNNAMED_ALONE, UNNAMED_ON_THE_FLOOR, Answer, answer
+from mjx_refine.diagnosis.fits.candidates import Freed
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.misfit.signs import MOSTLY, signs
 from mjx_refine.effects import acting_kind, catalogue, kind_of
 from mjx_refine.effects.free_force import KNOTS
 from mjx_refine.errors import InputError

@@ -9,9 +9,9 @@ import pytest
 from effect_scenes import CAMERA
 
 from mjx_refine.batch import batch_from_scenes
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.numbers import values_of
-from mjx_refine.diagnosis.screen import term_of
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.fits.numbers import values_of
+from mjx_refine.diagnosis.search.screen import term_of
 from mjx_refine.effects.hidden_obstacle import HiddenObstacle, gaps
 from mjx_refine.effects.kind import FitView
 from mjx_refine.scene import Body, Scene

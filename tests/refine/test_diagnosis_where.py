@@ -9,9 +9,9 @@ import pytest
 from test_diagnosis import FLIGHT, clip_of
 from test_diagnosis_replay import started
 
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.where import background_energy, places_of
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.fits.shown import view_of
+from mjx_refine.diagnosis.misfit.where import background_energy, places_of
 from mjx_refine.space import Space
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from mjx_refine.diagnosis import gaps
-from mjx_refine.diagnosis.gaps import gap_between
-from mjx_refine.diagnosis.measure import measure
+from mjx_refine.diagnosis.seen import gaps
+from mjx_refine.diagnosis.seen.gaps import gap_between
+from mjx_refine.diagnosis.seen.measure import measure
 from mjx_refine.observation import Observation
 
 FRAMES, HEIGHT, WIDTH = 10, 90, 160

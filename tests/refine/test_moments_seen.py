@@ -10,10 +10,10 @@ from effect_scenes import effect
 from own_clip import FLIGHT, OwnClip
 
 from mjx_refine.batch import SceneBatch
-from mjx_refine.diagnosis.measure import Parts, measure
-from mjx_refine.diagnosis.noise import MORE_THAN_ROUGH, Counts, everywhere, settled
-from mjx_refine.diagnosis.predict import Predictor
-from mjx_refine.diagnosis.slack import slack_of, sustained, touching
+from mjx_refine.diagnosis.fits.slack import slack_of, sustained, touching
+from mjx_refine.diagnosis.seen.measure import Parts, measure
+from mjx_refine.diagnosis.seen.noise import MORE_THAN_ROUGH, Counts, everywhere, settled
+from mjx_refine.diagnosis.seen.predict import Predictor
 from mjx_refine.effects import batch_with_effects
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Body, Camera, Scene

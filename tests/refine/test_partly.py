@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mjx_refine.diagnosis.before import before_others
-from mjx_refine.diagnosis.partly import half_planes, masks_within
+from mjx_refine.diagnosis.seen.before import before_others
+from mjx_refine.diagnosis.seen.partly import half_planes, masks_within
 from mjx_refine.view.outline import directions
 from mjx_refine.view.seen import moments_within, polygon_sums
 

@@ -10,13 +10,13 @@ from test_diagnosis import clip_of
 from test_diagnosis_replay import started
 
 from mjx_refine.batch import Restart, concatenate
-from mjx_refine.diagnosis.base import base_space
-from mjx_refine.diagnosis.candidates import Candidate
-from mjx_refine.diagnosis.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.nodes import COORDINATES, LEAST_LEFT, missing, with_struck
-from mjx_refine.diagnosis.shooting import base_with_nodes, found_before, with_nodes, with_nodes_of
-from mjx_refine.diagnosis.slack import Impact
-from mjx_refine.diagnosis.tempered import tempered
+from mjx_refine.diagnosis.fits.base import base_space
+from mjx_refine.diagnosis.fits.candidates import Candidate
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
+from mjx_refine.diagnosis.fits.nodes import COORDINATES, LEAST_LEFT, missing, with_struck
+from mjx_refine.diagnosis.fits.slack import Impact
+from mjx_refine.diagnosis.search.shooting import base_with_nodes, found_before, with_nodes, with_nodes_of
+from mjx_refine.diagnosis.search.tempered import tempered
 from mjx_refine.effects.acting import batch_with_effects
 from mjx_refine.scene import Body, Camera, Effect, Scene
 from mjx_refine.sim.c import MujocoSimulator

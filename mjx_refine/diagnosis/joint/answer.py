@@ -8,14 +8,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from mjx_refine.diagnosis.answer.verdict import AT_WORK, LIKELY, LITTLE, NAMED, Answer, answer
 from mjx_refine.diagnosis.diagnose import verdict_of
+from mjx_refine.diagnosis.fits.numbers import values_of
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.heldout import Outside
 from mjx_refine.diagnosis.joint.search import JointCandidate, JointCompared
-from mjx_refine.diagnosis.numbers import values_of
+from mjx_refine.diagnosis.misfit.signs import Signs, structure
 from mjx_refine.diagnosis.result import Ranked, Value, Verdict
-from mjx_refine.diagnosis.signs import Signs, structure
-from mjx_refine.diagnosis.verdict import AT_WORK, LIKELY, LITTLE, NAMED, Answer, answer
 
 JUDGED = 3
 """Single effects that are judged on held-out clips, the best evidence first."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from mjx_refine.diagnosis.fit import ClipFit
-from mjx_refine.diagnosis.measure import Parts
+from mjx_refine.diagnosis.fits.fit import ClipFit
+from mjx_refine.diagnosis.seen.measure import Parts
 
 
 def counts_of(clip: ClipFit) -> Float[np.ndarray, "residuals"]:

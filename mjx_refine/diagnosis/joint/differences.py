@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mjx_refine.diagnosis.fits.pace import OWN, STEPS, probe, tells_jags, without_jags
 from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis
-from mjx_refine.diagnosis.pace import OWN, STEPS, probe, tells_jags, without_jags
 
 Sizes = Sequence[Any]
 """Of differences, a clip each: one for all of its numbers, or one for each; None where its derivatives are not asked for."""

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mjx_refine.batch import concatenate
-from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit, prior
-from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.fit import SCALE, ClipFit, Fit, prior
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.pace import DAMPINGS, Pace, behind
+from mjx_refine.diagnosis.fits.store import Arrays, fingerprint, packed, remembered, unpacked
 from mjx_refine.diagnosis.joint.arrow import Arrow
 from mjx_refine.diagnosis.joint.differences import JointDifferences, Sizes
 from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis, with_frozen_setup
-from mjx_refine.diagnosis.pace import DAMPINGS, Pace, behind
-from mjx_refine.diagnosis.store import Arrays, fingerprint, packed, remembered, unpacked
 from mjx_refine.effects.loading import has_loads
 
 Keeps = Sequence[Bool[np.ndarray, "frames"]] | None

@@ -13,11 +13,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.heldout import BLOCK, in_common
-from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.fit import ClipFit, Fit
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
 from mjx_refine.diagnosis.joint.counts import counts_of
 from mjx_refine.diagnosis.joint.hypothesis import with_frozen_setup
+from mjx_refine.diagnosis.misfit.heldout import BLOCK, in_common
 
 EARLY = 0.4
 """Part of a held-out clip on which its start is fitted."""

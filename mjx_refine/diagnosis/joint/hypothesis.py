@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mjx_refine.batch import geom_size
-from mjx_refine.diagnosis.hypothesis import Hypothesis, Term
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, Term
 from mjx_refine.scene import Body, Camera, Scene
 from mjx_refine.space import Space
 from mjx_refine.space.layout import lowest_extent

@@ -11,7 +11,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from mjx_refine.diagnosis.fit import Fit
+from mjx_refine.diagnosis.fits.fit import Fit
+from mjx_refine.diagnosis.fits.shown import view_of
+from mjx_refine.diagnosis.fits.store import Store
 from mjx_refine.diagnosis.joint.heldout import early_part
 from mjx_refine.diagnosis.joint.hypothesis import common_scenes
 from mjx_refine.diagnosis.joint.together import (
@@ -31,8 +33,6 @@ from mjx_refine.diagnosis.poses.heldout import Errors, errors_of
 from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.diagnosis.poses.where import describe, misfit_map, seen_frames
 from mjx_refine.diagnosis.result import ClipGap, Diagnosis, Gap, PoseErrors
-from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.store import Store
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 from mjx_refine.observation import Observation

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from mjx_refine.diagnosis.fit import SCALE
+from mjx_refine.diagnosis.fits.fit import SCALE
 from mjx_refine.diagnosis.joint.arrow import Arrow
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
-from mjx_refine.diagnosis.screen import Lead, Screen, distinct, families_of
+from mjx_refine.diagnosis.search.screen import Lead, Screen, distinct, families_of
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import EffectKind, FitView, Start
 

@@ -7,17 +7,17 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mjx_refine.diagnosis.candidates import lead_of
-from mjx_refine.diagnosis.fit import SCALE, Fit
-from mjx_refine.diagnosis.fitted import Explained
+from mjx_refine.diagnosis.fits.candidates import lead_of
+from mjx_refine.diagnosis.fits.fit import SCALE, Fit
+from mjx_refine.diagnosis.fits.fitted import Explained
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.screen import JointScreen
 from mjx_refine.diagnosis.joint.slack import set_slackness, with_slackness
-from mjx_refine.diagnosis.leads import FORGIVING, chosen_of
-from mjx_refine.diagnosis.pairs import PROMISE_OF_PAIRS, SECOND_PROMISE
-from mjx_refine.diagnosis.screen import Lead
-from mjx_refine.diagnosis.singles import target_name
-from mjx_refine.diagnosis.tempered import Told
+from mjx_refine.diagnosis.search.leads import FORGIVING, chosen_of
+from mjx_refine.diagnosis.search.pairs import PROMISE_OF_PAIRS, SECOND_PROMISE
+from mjx_refine.diagnosis.search.screen import Lead
+from mjx_refine.diagnosis.search.singles import target_name
+from mjx_refine.diagnosis.search.tempered import Told
 from mjx_refine.effects import catalogue
 from mjx_refine.effects.kind import FitView
 

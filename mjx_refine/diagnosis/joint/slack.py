@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mjx_refine.diagnosis.fit import ClipFit
+from mjx_refine.diagnosis.fits.fit import ClipFit
 from mjx_refine.diagnosis.joint.counts import counts_of
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 

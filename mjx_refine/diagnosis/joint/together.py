@@ -8,18 +8,18 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mjx_refine.diagnosis.fit import ClipFit, Fit
-from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.answer.verdict import LITTLE
+from mjx_refine.diagnosis.fits.fit import ClipFit, Fit
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.store import Store
 from mjx_refine.diagnosis.joint.answer import Said, ranked, said, to_judge
 from mjx_refine.diagnosis.joint.fit import Clips, JointFit
 from mjx_refine.diagnosis.joint.heldout import EARLY, Foretold, Outside, early_part, excused, foretell, split
 from mjx_refine.diagnosis.joint.hypothesis import JointHypothesis
 from mjx_refine.diagnosis.joint.search import JointCandidate, JointCompared, Seen, compare_together
 from mjx_refine.diagnosis.joint.slack import GRID
+from mjx_refine.diagnosis.misfit.where import places_of
 from mjx_refine.diagnosis.result import ClipGap, Diagnosis, Gap, Place, PoseErrors
-from mjx_refine.diagnosis.store import Store
-from mjx_refine.diagnosis.verdict import LITTLE
-from mjx_refine.diagnosis.where import places_of
 from mjx_refine.effects.kind import FitView
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Scene

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from mjx_refine.diagnosis.base import base_space, stored_base
 from mjx_refine.diagnosis.diagnose import prepared
-from mjx_refine.diagnosis.fit import ClipFit, Fit
+from mjx_refine.diagnosis.fits.base import base_space, stored_base
+from mjx_refine.diagnosis.fits.fit import ClipFit, Fit
+from mjx_refine.diagnosis.fits.shown import view_of
+from mjx_refine.diagnosis.fits.store import Store
 from mjx_refine.diagnosis.joint.heldout import Foretold
 from mjx_refine.diagnosis.joint.hypothesis import common_scenes
 from mjx_refine.diagnosis.joint.together import (
@@ -24,11 +26,9 @@ from mjx_refine.diagnosis.joint.together import (
     result,
     run,
 )
+from mjx_refine.diagnosis.misfit.signs import map_of
+from mjx_refine.diagnosis.misfit.where import describe, misfit_map
 from mjx_refine.diagnosis.result import Diagnosis
-from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.signs import map_of
-from mjx_refine.diagnosis.store import Store
-from mjx_refine.diagnosis.where import describe, misfit_map
 from mjx_refine.effects.kind import FitView
 from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation

@@ -9,22 +9,22 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mjx_refine.diagnosis.candidates import Candidate, Compared
+from mjx_refine.diagnosis.answer.verdict import Answer, answer, upheld
 from mjx_refine.diagnosis.diagnose import ranked, verdict_of
-from mjx_refine.diagnosis.fit import Fit
-from mjx_refine.diagnosis.heldout import HeldOut
+from mjx_refine.diagnosis.fits.candidates import Candidate, Compared
+from mjx_refine.diagnosis.fits.fit import Fit
+from mjx_refine.diagnosis.fits.shown import view_of
+from mjx_refine.diagnosis.fits.store import Store
+from mjx_refine.diagnosis.misfit.heldout import HeldOut
+from mjx_refine.diagnosis.misfit.signs import Signs, best_candidate, signs
+from mjx_refine.diagnosis.misfit.where import places_of
 from mjx_refine.diagnosis.poses.data import Poses
 from mjx_refine.diagnosis.poses.fit import PosesFit, rate_of
 from mjx_refine.diagnosis.poses.heldout import Errors, errors_of, held_out, total
 from mjx_refine.diagnosis.poses.start import fit_base, poses_space, started
 from mjx_refine.diagnosis.poses.where import describe, misfit_map, seen_frames
 from mjx_refine.diagnosis.result import Diagnosis, Gap, PoseErrors
-from mjx_refine.diagnosis.search import compare
-from mjx_refine.diagnosis.shown import view_of
-from mjx_refine.diagnosis.signs import Signs, best_candidate, signs
-from mjx_refine.diagnosis.store import Store
-from mjx_refine.diagnosis.verdict import Answer, answer, upheld
-from mjx_refine.diagnosis.where import places_of
+from mjx_refine.diagnosis.search.compare import compare
 from mjx_refine.effects import catalogue
 from mjx_refine.errors import InputError
 from mjx_refine.observation import Observation

@@ -14,16 +14,16 @@ from jaxtyping import Bool, Float
 
 from mjx_refine import rotations
 from mjx_refine.batch import SceneBatch
-from mjx_refine.diagnosis.apart import Flight
-from mjx_refine.diagnosis.fit import SCALE, ClipFit, Fit
-from mjx_refine.diagnosis.measure import Measured, Parts
-from mjx_refine.diagnosis.noise import Counts, Noise
-from mjx_refine.diagnosis.pace import STEPS
+from mjx_refine.diagnosis.fits.apart import Flight
+from mjx_refine.diagnosis.fits.fit import SCALE, ClipFit, Fit
+from mjx_refine.diagnosis.fits.pace import STEPS
+from mjx_refine.diagnosis.fits.settled import Loose
+from mjx_refine.diagnosis.fits.slack import Contacts, Impact, contacts
+from mjx_refine.diagnosis.fits.store import fingerprint
 from mjx_refine.diagnosis.poses.data import Poses, noise_of, rotation_vector
-from mjx_refine.diagnosis.predict import Prediction
-from mjx_refine.diagnosis.settled import Loose
-from mjx_refine.diagnosis.slack import Contacts, Impact, contacts
-from mjx_refine.diagnosis.store import fingerprint
+from mjx_refine.diagnosis.seen.measure import Measured, Parts
+from mjx_refine.diagnosis.seen.noise import Counts, Noise
+from mjx_refine.diagnosis.seen.predict import Prediction
 from mjx_refine.search.residuals import slowed
 from mjx_refine.sim.backends import Restarting
 

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mjx_refine.diagnosis.fit import Fit
-from mjx_refine.diagnosis.heldout import BLOCK, HeldOut
+from mjx_refine.diagnosis.fits.fit import Fit
+from mjx_refine.diagnosis.misfit.heldout import BLOCK, HeldOut
 from mjx_refine.diagnosis.poses.fit import VIDEO, PosesFit
 
 BINS = 1.0 / VIDEO

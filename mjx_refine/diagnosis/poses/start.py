@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine import rotations
-from mjx_refine.diagnosis.base import GOOD, base_space
-from mjx_refine.diagnosis.fit import Fit
-from mjx_refine.diagnosis.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.base import GOOD, base_space
+from mjx_refine.diagnosis.fits.fit import Fit
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
 from mjx_refine.diagnosis.poses.data import Poses, rotation_vector
 from mjx_refine.diagnosis.poses.fit import PosesFit
 from mjx_refine.scene import Body, Scene

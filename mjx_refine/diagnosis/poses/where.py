@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from mjx_refine.diagnosis.fit import Fit
+from mjx_refine.diagnosis.fits.fit import Fit
+from mjx_refine.diagnosis.misfit.where import phase_of
 from mjx_refine.diagnosis.poses.fit import PosesFit
 from mjx_refine.diagnosis.poses.heldout import shifts_of
 from mjx_refine.diagnosis.result import CHANNELS
-from mjx_refine.diagnosis.where import phase_of
 from mjx_refine.effects.kind import FitView
 
 QUIET = 0.3

@@ -1,0 +1,1 @@
+"""Hypotheses and their least squares: numbers, residuals, derivatives, what contacts may err by."""
