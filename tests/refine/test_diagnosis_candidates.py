@@ -24,8 +24,8 @@ from mjx_refine.diagnosis.fits.candidates import (
 )
 from mjx_refine.diagnosis.fits.fitted import Fit
 from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
-from mjx_refine.diagnosis.search.compare import compare as search
-from mjx_refine.diagnosis.search.compare import pairs, singles
+from mjx_refine.diagnosis.search import compare as search
+from mjx_refine.diagnosis.search import pairs, singles
 from mjx_refine.diagnosis.search.walls import push_last
 from mjx_refine.effects.push import Push
 from mjx_refine.sim.c import MujocoSimulator

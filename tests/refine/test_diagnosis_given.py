@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from test_diagnosis_tempered import ROLL, quiet, started_with
 
-from mjx_refine.diagnosis.search.compare import given
+from mjx_refine.diagnosis.search import given
 from mjx_refine.diagnosis.search.given import GO_ON, far_from_given
 
 

@@ -10,8 +10,8 @@ import pytest
 from test_diagnosis_candidates import candidate
 
 from mjx_refine.diagnosis.fits.candidates import DOUBT, OUTDONE, Candidate, rivals
-from mjx_refine.diagnosis.search.compare import compare as search
-from mjx_refine.diagnosis.search.compare import exchange, pairs, singles
+from mjx_refine.diagnosis.search import compare as search
+from mjx_refine.diagnosis.search import exchange, pairs, singles
 
 BEST = candidate(1000.0, ("camera_shake", -1))
 NEAR = candidate(1.01 * OUTDONE * BEST.lead, ("drag", 0))

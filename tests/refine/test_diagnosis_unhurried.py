@@ -9,8 +9,8 @@ from test_diagnosis import FLIGHT
 from test_diagnosis_tempered import ROLL, quiet, started_with
 
 from mjx_refine.diagnosis.fits.candidates import Candidate, Compared
-from mjx_refine.diagnosis.search.compare import compare as search
-from mjx_refine.diagnosis.search.compare import given
+from mjx_refine.diagnosis.search import compare as search
+from mjx_refine.diagnosis.search import given
 from mjx_refine.diagnosis.search.unhurried import END, unhurried
 from mjx_refine.effects import catalogue
 
