@@ -12,9 +12,10 @@ from test_shooting import BALL
 
 from mjx_refine.diagnosis.fits.base import base_space
 from mjx_refine.diagnosis.fits.fit import SCALE
-from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, term
 from mjx_refine.diagnosis.fits.shown import view_of
-from mjx_refine.diagnosis.search.lost import NAME, PROMISED, lost_frames
+from mjx_refine.diagnosis.search import singles
+from mjx_refine.diagnosis.search.lost import NAME, PROMISED, lost_frames, recounted
 from mjx_refine.diagnosis.search.shooting import base_with_nodes, with_nodes
 from mjx_refine.scene import Effect
 
@@ -44,6 +45,36 @@ def test_missing_frames_are_found_to_the_frame_beside_the_base_model(dropped):
     assert found.names == (NAME,)
     assert found.lead > PROMISED
     assert found.fit.hypothesis.terms[0].centre.tolist() == [10.0, 3.0]
+
+
+@pytest.fixture(scope="module")
+def miscounted(dropped):
+    """The fit with two frames too few, to which ordinary numbers have bent."""
+    clip, base, _ = dropped
+    return clip.fit(base.hypothesis.added(term(NAME, -1, clip.frames, np.array([10.0, 1.0]))), base.z, 10)
+
+
+def test_a_wrong_count_is_left_for_the_one_beside_it(dropped, miscounted):
+    clip, _, _ = dropped
+    better = recounted(clip, miscounted)
+    assert better.hypothesis.terms[0].centre.tolist() == [10.0, 3.0]
+    assert better.evidence > miscounted.evidence + PROMISED
+
+
+@pytest.mark.parametrize("rival", [0.0, np.inf])
+def test_frames_are_counted_anew_once_where_they_lead_by_much(dropped, miscounted, monkeypatch, rival):
+    clip, _, _ = dropped
+    asked = []
+    monkeypatch.setattr(singles, "recounted", lambda clip, fit: asked.append(fit) or fit)
+    base = dataclasses.replace(miscounted, evidence=miscounted.evidence - 1.01 * singles.CLEAR)
+    fitted = {
+        (NAME, -1): (miscounted, 1.0),
+        ("push", 0): (dataclasses.replace(base, evidence=base.evidence + rival), 1.0),
+    }
+    before: list = []
+    for _ in range(2):
+        singles._recounted(clip, base, fitted, before)
+    assert len(asked) == (1 if rival == 0.0 else 0)
 
 
 def test_nothing_is_missing_where_nothing_is():

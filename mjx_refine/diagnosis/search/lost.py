@@ -10,9 +10,9 @@ from jaxtyping import Float
 
 from mjx_refine.diagnosis.fits.candidates import Candidate, lead_of
 from mjx_refine.diagnosis.fits.fit import ClipFit, Fit
-from mjx_refine.diagnosis.fits.hypothesis import Hypothesis
+from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, Term
 from mjx_refine.diagnosis.fits.knock import knocked
-from mjx_refine.diagnosis.search.screen import Lead, Screen
+from mjx_refine.diagnosis.search.screen import Screen
 from mjx_refine.effects.kind import FitView
 
 NAME = "dropped_frames"
@@ -28,26 +28,36 @@ def lost_frames(clip: ClipFit, base: Fit, view: FitView) -> tuple[Candidate, ...
     leads = [lead for lead in Screen(clip, base, view).leads([NAME]) if lead.gain > PROMISED]
     if not leads:
         return ()
-    best, (frame, count) = base, leads[0].start.values
-    tried = {(frame, count)}
-    rows = [(leads[0], base.z)]
-    for _ in range(ROUNDS):
-        fits = clip.crew.each(clip, _fitted, [(base.hypothesis, lead, z) for lead, z in rows])
-        found = max(fits, key=lambda fit: fit.evidence, default=best)
-        if found.evidence <= best.evidence:
-            break
-        best = found
-        frame, count = best.hypothesis.terms[0].centre
-        near = {(frame + a, count + b) for a, b in itertools.product((-1, 0, 1), repeat=2)} - tried
-        tried |= near
-        rows = [(_at(leads[0], f, c), best.z) for f, c in sorted(near) if 1 <= f < clip.frames and c != 0]
+    begun = _fitted(clip, base.hypothesis.added(leads[0].term(clip.frames)), base.z)
+    best = recounted(clip, begun) if begun.evidence > base.evidence else base
     lead = lead_of(best, base)
     return (Candidate(best, lead, leads[0].gain),) if lead > PROMISED else ()
 
 
-def _at(lead: Lead, frame: float, count: float) -> Lead:
-    return dataclasses.replace(lead, start=dataclasses.replace(lead.start, values=np.array([frame, count])))
+def recounted(clip: ClipFit, best: Fit) -> Fit:
+    """A fit with frames that are missing or doubled alone, or a better one with another frame or count beside its own.
+
+    Ordinary numbers bend to what a wrong count leaves, and the linear look from there tells that wrong count.
+    """
+    tried: set[tuple[float, float]] = set()
+    for _ in range(ROUNDS):
+        (lost,) = best.hypothesis.terms
+        frame, count = lost.centre
+        tried |= {(frame, count)}
+        near = {(frame + a, count + b) for a, b in itertools.product((-1, 0, 1), repeat=2)} - tried
+        tried |= near
+        beside = [np.array(place) for place in sorted(near) if 1 <= place[0] < clip.frames and place[1] != 0]
+        rows = [(_with(best.hypothesis, dataclasses.replace(lost, centre=place)), best.z) for place in beside]
+        found = max(clip.crew.each(clip, _fitted, rows), key=lambda fit: fit.evidence, default=best)
+        if found.evidence <= best.evidence:
+            break
+        best = found
+    return best
 
 
-def _fitted(clip: ClipFit, plain: Hypothesis, lead: Lead, z: Float[np.ndarray, "dimension"]) -> Fit:
-    return knocked(clip, clip.fit(plain.added(lead.term(clip.frames)), z, ITERATIONS, thorough=False))
+def _with(hypothesis: Hypothesis, term: Term) -> Hypothesis:
+    return dataclasses.replace(hypothesis, terms=(term,))
+
+
+def _fitted(clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimension"]) -> Fit:
+    return knocked(clip, clip.fit(hypothesis, z, ITERATIONS, thorough=False))

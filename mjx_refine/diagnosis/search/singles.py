@@ -13,6 +13,8 @@ from mjx_refine.diagnosis.fits.roam import ROAMED_AGAIN
 from mjx_refine.diagnosis.search.exchange import Fitted, Key, at_least_nothing, exchanged
 from mjx_refine.diagnosis.search.given import far_from_given, leaves_much
 from mjx_refine.diagnosis.search.leads import FORGIVING, begun, chosen_of
+from mjx_refine.diagnosis.search.lost import NAME as LOST
+from mjx_refine.diagnosis.search.lost import recounted
 from mjx_refine.diagnosis.search.patches import patches_from_pushes
 from mjx_refine.diagnosis.search.scattered import scattered
 from mjx_refine.diagnosis.search.screen import Lead, Screen
@@ -79,6 +81,7 @@ def singles_of(
     fitted, shots = dict(before), bool(base.hypothesis.nodes)
     unbent: list[Fit] = []
     walled: list[Fit] = []
+    counted: list[Fit] = []
     tried: Fit | None = None
     for again in range(2):
         told("looking ahead")
@@ -105,6 +108,7 @@ def singles_of(
         _keep_leads(clip, base, fitted, rows, told, scene)
         if not (video and _hardly(clip, base, fitted)):
             _in_place_of_pushes(clip, base, fitted, walled, view, names, told)
+            _recounted(clip, base, fitted, counted)
         best = max((fit for fit, _ in fitted.values()), key=lambda fit: fit.evidence, default=base)
         # What an effect's fit found for the base parameters may serve the base model as well.
         if best is tried or not fitted:
@@ -249,6 +253,17 @@ def _in_place_of_pushes(
         ):
             if patch is not None:
                 _keep(clip, fitted, ("friction_patch", -1), patch, promise)
+
+
+def _recounted(clip: ClipFit, base: Fit, fitted: Fitted, asked: list[Fit]) -> None:
+    """Frames that are missing or doubled, with another frame or count; ``asked`` are fits for which that was done before."""
+    found = fitted.get((LOST, -1))
+    most = max((lead_of(fit, base) for fit, _ in fitted.values()), default=0.0)
+    if found is None or any(found[0] is one for one in asked) or lead_of(found[0], base) <= max(CLEAR, IN_PLACE * most):
+        return
+    better = recounted(clip, found[0])
+    asked.append(better)
+    fitted[LOST, -1] = (better, found[1])
 
 
 def words(lead: Lead, scene: Scene) -> str:
