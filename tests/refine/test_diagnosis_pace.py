@@ -92,6 +92,21 @@ def test_least_squares_go_on_from_where_they_were_interrupted_over_jags_too():
     assert np.abs(ended.z - TRUE).max() < 0.2
 
 
+def test_where_only_the_place_counts_no_derivatives_are_made_there():
+    start, made = np.array([4.0, 4.0, -4.0]), []
+    for passing in (False, True):
+        differences = differences_of([0, 1, 2])
+        inner, calls = differences._jacobian, []
+        differences._jacobian = lambda z, size, inner=inner, calls=calls: calls.append(size) or inner(z, size)
+        made.append((descended(start, differences, prior, Effort(2, passing=passing)), len(calls)))
+    (whole, many), (passing, few) = made
+    assert np.array_equal(whole.z, passing.z)
+    assert whole.cost == passing.cost
+    assert whole.ended
+    assert not passing.ended
+    assert few < many
+
+
 # --- several clips ----------------------------------------------------------------------------------------------------
 
 

@@ -51,7 +51,7 @@ def replays(clip: ClipFit, fits: list[Fit], problem: Problem, matching: tuple[in
 
 def _rigid(clip: ClipFit, fit: Fit) -> np.ndarray:
     held, z = _held(fit)
-    return clip.fit(held, z, ITERATIONS).z
+    return clip.fit(held, z, ITERATIONS, passing=True).z
 
 
 def _replay(clip: ClipFit, fit: Fit, rigid: np.ndarray, problem: Problem, matching: tuple[int, ...]) -> Replay:

@@ -335,9 +335,10 @@ class ClipFit:
         rival: float = np.inf,
         attempts: int | None = None,
         thorough: bool = True,
+        passing: bool = False,
     ) -> Fit:
         """Levenberg-Marquardt from ``z`` with an ``Effort``."""
-        effort = Effort(iterations, rival, attempts, thorough)
+        effort = Effort(iterations, rival, attempts, thorough, passing)
         return self._descended(hypothesis, np.clip(z, *hypothesis.bounds), keep, scale, effort)
 
     @remembered

@@ -159,12 +159,14 @@ class Effort(NamedTuple):
       rival: cost of another hypothesis; what stays far behind it is given up.
       attempts: steps after which they are interrupted, whatever they were worth; never by default.
       thorough: whether larger differences are tried in the end. Where another fit goes on from there, that one tries them.
+      passing: whether only the place counts that they lead to: no derivatives are made there.
     """
 
     iterations: int
     rival: float = np.inf
     attempts: int | None = None
     thorough: bool = True
+    passing: bool = False
 
 
 class Pace:
@@ -268,4 +270,6 @@ def descended(
             slopes, fresh, usual = updated(slopes, step, change), False, gain
         elif gain > 0 or pace.failed or not fresh:
             slopes, fresh, surest, usual = differences.of(z, base, pace.size), True, False, 0.0
+    if effort.passing:
+        return Standing(z, base, cost, slopes, False)
     return Standing(z, base, cost, slopes if surest else differences.surest(z, base))

@@ -21,5 +21,5 @@ def staged(clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimensio
     frames = np.arange(clip.frames)
     for stage in range(1, STAGES + 1):
         keep = frames < 1 + np.ceil((clip.frames - 1) * stage / (STAGES + 1))
-        z = clip.fit(hypothesis, z, ITERATIONS, keep, thorough=False).z
+        z = clip.fit(hypothesis, z, ITERATIONS, keep, thorough=False, passing=True).z
     return clip.fit(hypothesis, z, LAST, thorough=False)

@@ -276,7 +276,7 @@ def _of_own_contacts(clip: ClipFit, base: Fit) -> Fit:
 def _along_own_contacts(clip: ClipFit, hypothesis: Hypothesis, z: Float[np.ndarray, "dimension"], anew: bool) -> Fit:
     """A fit with what may err along its own path; ``anew``: and along none to begin with."""
     if anew:
-        begun = clip.fit(hypothesis, z, FIRST, scale=FORGIVING)
+        begun = clip.fit(hypothesis, z, FIRST, scale=FORGIVING, passing=True)
         hypothesis, z = dataclasses.replace(hypothesis, slack=clip.slack_along(begun)), begun.z
     return knocked(clip, clip.fit(hypothesis, z, 10))
 

@@ -75,5 +75,5 @@ def _begun(clip: ClipFit, plain: Hypothesis, view: FitView, name: str, target: i
 
 
 def _on(clip: ClipFit, fit: Fit) -> Fit:
-    fit = clip.fit(cooled(clip, fit), fit.z, FURTHER, thorough=False)
+    fit = clip.fit(cooled(clip, fit), fit.z, FURTHER, thorough=False, passing=True)
     return knocked(clip, clip.fit(cooled(clip, fit), fit.z, REST))

@@ -43,6 +43,6 @@ def begun(clip: ClipFit, here: Fit, lead: Lead, scale: float) -> tuple[Hypothesi
     z = beginning(clip, hypothesis, here, lead, lead.z(one))
     if scale <= SCALE:
         return hypothesis, z
-    fit = clip.fit(hypothesis, z, FIRST, scale=scale, thorough=False)
+    fit = clip.fit(hypothesis, z, FIRST, scale=scale, thorough=False, passing=True)
     # Far from where it began, contacts are others.
     return dataclasses.replace(hypothesis, slack=clip.slack_along(fit)), fit.z

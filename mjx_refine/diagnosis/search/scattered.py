@@ -118,7 +118,7 @@ def _look(clip: ClipFit, fit: Fit, z: Float[np.ndarray, "dimension"], warm: tupl
     there = dataclasses.replace(fit, hypothesis=fit.hypothesis.rigid, z=z)
     for factor in warm:
         with tempered(clip, factor):
-            there = clip.fit(there.hypothesis, there.z, WARMING, thorough=False)
+            there = clip.fit(there.hypothesis, there.z, WARMING, thorough=False, passing=True)
     # What strikes may not err yet.
     rival = np.inf if fit.hypothesis.strikes else fit.cost
     return clip.fit(cooled(clip, there), there.z, LOOK + REST, rival=rival, attempts=LOOK, thorough=False)
