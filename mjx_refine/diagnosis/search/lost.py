@@ -1,4 +1,5 @@
-"""Frames that are missing or doubled near an impact, which the state that an object goes on from after it would take in."""
+"""Frames that are missing or doubled: before states after impacts would take them in, and with another frame or count than was
+fitted."""
 
 from __future__ import annotations
 
@@ -39,11 +40,10 @@ def recounted(clip: ClipFit, best: Fit) -> Fit:
 
     Ordinary numbers bend to what a wrong count leaves, and the linear look from there tells that wrong count.
     """
-    tried: set[tuple[float, float]] = set()
+    tried = {tuple(best.hypothesis.terms[0].centre)}
     for _ in range(ROUNDS):
         (lost,) = best.hypothesis.terms
         frame, count = lost.centre
-        tried |= {(frame, count)}
         near = {(frame + a, count + b) for a, b in itertools.product((-1, 0, 1), repeat=2)} - tried
         tried |= near
         beside = [np.array(place) for place in sorted(near) if 1 <= place[0] < clip.frames and place[1] != 0]
