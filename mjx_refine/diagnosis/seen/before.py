@@ -104,7 +104,7 @@ def _shared(frame: np.ndarray, one: int, others: list[int]) -> Float[np.ndarray,
     mask = part == one
     # The gradient of a smoothed mask, summed across its border, is one for each pixel of the border's length.
     length = ndimage.gaussian_gradient_magnitude(mask.astype(float), 1.0, mode="nearest")
-    length[~np.asarray(ndimage.binary_dilation(np.isin(part, others), iterations=ACROSS))] = 0.0
+    length[~np.asarray(ndimage.binary_dilation(np.isin(part, others), iterations=ACROSS), bool)] = 0.0
     rows, columns = np.indices(mask.shape)
     row, column = ndimage.center_of_mass(mask)
     area = float(mask.sum())

@@ -136,4 +136,4 @@ def _evenly(away: Float[np.ndarray, "pixels"]) -> bool:
 
 
 def _outline(mask: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:
-    return mask & ~np.asarray(ndimage.binary_erosion(mask, border_value=1))
+    return mask & ~np.asarray(ndimage.binary_erosion(mask, border_value=1), bool)
