@@ -11,6 +11,7 @@ from effect_scenes import BALL, CAMERA, FPS, GRAVITY, STEP, effect, rolled_out
 
 from mjx_refine import rotations
 from mjx_refine.effects import batch_with_effects
+from mjx_refine.effects.friction_patch import _stretches
 from mjx_refine.effects.loading import Loading
 from mjx_refine.scene import Body, Scene
 from mjx_refine.sim.c import MujocoSimulator
@@ -132,6 +133,19 @@ def test_a_patch_has_its_own_stopping_distance():
     np.testing.assert_allclose(entered[-1, 0, 0], 0.5 + left, rtol=0.03)
     beside = rolled_out(effect("friction_patch", x=0.0, y=9.0, radius=5.0, friction=0.4), **state)
     np.testing.assert_allclose(beside, rolled_out(**state), atol=1e-6)
+
+
+def test_a_path_is_smooth_in_where_a_patch_begins():
+    """A step covers some 8 mm: were all of it inside or none, most borders would change nothing, and some 6 mm at once."""
+    box = Body("box", "ball", (0.3, 0.3, 0.05), (0.0, 0.0, 0.05), friction=(0.1, 0.0), damping=-100.0)
+    state = {"gravity": GRAVITY, "body": box, "linear_velocity": (2.0, 0.0, 0.0), "frames": 31}
+    borders = np.arange(0.49, 0.508, 0.001)
+    patches = [effect("friction_patch", x=border + 5.0, y=0.0, radius=5.0, friction=0.4) for border in borders]
+    ends = np.array([rolled_out(patch, **state)[-1, 0, 0] for patch in patches])
+    assert np.abs(np.diff(ends)).max() < 0.0025
+    assert (np.abs(np.diff(ends)) > 1e-5).mean() > 0.75
+    # It gets 0.75 m farther for every metre that the border does: 1 - 0.1 / 0.4.
+    np.testing.assert_allclose(np.polyfit(borders, ends, 1)[0], 0.75, atol=0.25)
 
 
 def test_the_centre_of_mass_flies_a_parabola():
@@ -303,3 +317,13 @@ def test_a_wall_is_looked_at_seldom_and_never_too_late(monkeypatch):
     assert np.median(apart) < 1e-6
     assert np.quantile(apart, 0.9) < 1e-4
     assert looks[0] < 0.4 * looks[1]
+
+
+def test_patches_begin_where_a_path_may_lead_in_and_out():
+    path = np.stack([np.linspace(0.0, 1.4, 15), np.zeros(15)], 1)
+    found = _stretches(path)
+    assert all(centre[1] == 0.0 and radius > 0.05 for centre, radius in found)
+    borders = {round(float(centre[0] + side * radius), 6) for centre, radius in found for side in (-1, 1)}
+    assert borders == {-0.42, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.82}
+    # All pairs of eight borders but the first with the last.
+    assert len(found) == 27
