@@ -194,3 +194,19 @@ def scene_from_batch(batch: SceneBatch, row: int, like: Scene) -> Scene:
         fovy=float(np.rad2deg(batch.camera_fovy[row])),
     )
     return dataclasses.replace(like, objects=tuple(bodies), camera=camera, gravity=tuple(batch.gravity[row].tolist()))
+
+
+def uniform_inertia(batch: SceneBatch) -> Float[np.ndarray, "batch objects 3"]:
+    """Principal moments of inertia of bodies of uniform density [kg m^2]."""
+    columns = []
+    for i, shape in enumerate(batch.shapes):
+        x, y, z = np.moveaxis(batch.size[:, i], -1, 0)
+        if shape == "sphere":
+            unit = np.stack([0.4 * x**2] * 3, -1)
+        elif shape == "cylinder":
+            across = x**2 / 4 + (2 * y) ** 2 / 12
+            unit = np.stack([across, across, x**2 / 2], -1)
+        else:
+            unit = np.stack([y**2 + z**2, x**2 + z**2, x**2 + y**2], -1) / 3
+        columns.append(unit * batch.mass[:, i, None])
+    return np.stack(columns, 1)

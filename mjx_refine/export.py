@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
 from mjx_refine import files, rotations
-from mjx_refine.batch import SceneBatch
+from mjx_refine.batch import BatchEffect, SceneBatch
 from mjx_refine.effects import acting, batch_with_effects
-from mjx_refine.effects.hidden_obstacle import damping_of, stiffness_of
+from mjx_refine.effects.hidden_obstacle import damping_of, gaps, pressed_by, stiffness_of
 from mjx_refine.effects.wind import felt_shadow
 from mjx_refine.errors import InputError
 from mjx_refine.scene import Camera, Scene
+from mjx_refine.sim.c import MujocoSimulator
 from mjx_refine.sim.model import SUBSTEPS, contact_pairs, initial_state, model_fields
 
 KEYFRAME = "start"
@@ -23,6 +26,9 @@ KEYFRAME = "start"
 
 EXPORTED = ("slope", "offset_com", "camera_roll", "hidden_obstacle", "wind", "drag")
 """Effects that MuJoCo's XML can hold, the last in part."""
+
+LOOKED_AHEAD, HIT = 10.0, 64
+"""For how long an exported obstacle's first hit is looked for [s], and steps in which it is over."""
 
 _RESERVED = ("floor", "world")
 _COLOURS = ("0.95 0.75 0.1", "0.1 0.65 0.9", "0.95 0.35 0.6", "0.35 0.8 0.35", "0.95 0.5 0.15", "0.6 0.45 0.95")
@@ -196,26 +202,70 @@ def _obstacles(
     for effect in batch.effects:
         if effect.name != "hidden_obstacle":
             continue
-        angle, distance, restitution = effect.values[0]
+        angle, distance, _ = effect.values[0]
         name = "obstacle"
         while name in names or world.find(f"geom[@name='{name}']") is not None:
             name += "_"
         turn = math.radians(angle)
         normal = np.array([math.cos(turn), math.sin(turn), 0.0])
         half = math.sqrt(0.5)
+        shift, damping = _as_simulated(batch, effect, fps)
         place = {
-            "pos": _numbers(normal * distance),
+            "pos": _numbers(normal * (distance + shift)),
             "quat": _numbers((half, -half * math.sin(turn), half * math.cos(turn), 0.0)),
         }
         look = {"size": "1 1 0.05", "rgba": "0.8 0.3 0.3 0.2", "contype": "0", "conaffinity": "0"}
         _add(world, "geom", name=name, type="plane", **place, **look)
         # The largest impedance that MuJoCo takes: the contact's acceleration is that of the damped spring.
         step = 1.0 / (fps * SUBSTEPS)
-        solref = _numbers((-stiffness_of(step), -damping_of(restitution, step)))
+        solref = _numbers((-stiffness_of(step), -damping))
         spring = {"solref": solref, "solimp": "0.9999 0.9999 0.001 0.5 2"}
         sliding = float(batch.friction[0, effect.target, 0])
         rub = {"friction": _numbers((sliding, sliding, 0.0, 0.0, 0.0)), "solreffriction": _numbers((-1.0, -1.0 / step))}
         _add(contact, "pair", geom1=name, geom2=names[effect.target], condim="3", **spring, **rub)
+
+
+def _as_simulated(batch: SceneBatch, effect: BatchEffect, fps: float) -> tuple[float, float]:
+    """By how much MuJoCo's plane must stand farther from the origin, and its contact's damping, for the target's first hit to
+    return what the simulator's returns [m, 1/s].
+
+    MuJoCo begins to push in the first step that finds the target in the plane: where within a step that is reached makes a
+    difference of up to 0.1 of the speed, which the simulator's effect does not know.
+    """
+    step, frames = 1.0 / (fps * SUBSTEPS), math.ceil(LOOKED_AHEAD * fps)
+    alone = dataclasses.replace(batch, effects=tuple(e for e in batch.effects if e is not effect))
+    poses = MujocoSimulator(batch.shapes, fps, 1).rollout(alone, frames)[0]
+    gap = gaps(alone, poses, effect.target, effect.values[0])
+    hits = np.flatnonzero((gap[1:] <= 0) & (gap[:-1] > 0))
+    before = int(hits[0]) if len(hits) else 0
+    # Where nothing is hit, any hit will do.
+    away, speed = (gap[before], (gap[before] - gap[before + 1]) * fps) if len(hits) else (2.3 * step, 1.0)
+    wanted = damping_of(effect.values[0, 2], step)
+    speed_of, place_of = _after_hit(
+        -away, speed, step, lambda d, v: np.where(d > -v * step, pressed_by(d, v, wanted, step), 0.0)
+    )
+    damping, shift = np.meshgrid(np.linspace(0.0, 0.9 / step, 181), np.linspace(-1.0, 1.0, 81) * speed * step)
+    told = _after_hit(
+        -away + shift,
+        np.full(shift.shape, speed),
+        step,
+        lambda d, v: np.where(d > 0, np.maximum(stiffness_of(step) * d + damping * v, 0.0), 0.0),
+    )
+    # Half a second later.
+    off = (told[1] - shift - place_of + 0.5 * (told[0] - speed_of)) ** 2 + (told[1] - shift - place_of) ** 2
+    best = int(np.argmin(off))
+    return float(shift.flat[best]), float(damping.flat[best])
+
+
+def _after_hit(
+    depth, speed, step: float, pressed: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Speed into a wall, and how deep in it, once something has come to it and gone."""
+    depth, speed = np.asarray(depth, np.float64), np.asarray(speed, np.float64)
+    for _ in range(HIT):
+        speed = speed - step * pressed(depth, speed)
+        depth = depth + step * speed
+    return speed, depth
 
 
 def _forces(root: ElementTree.Element, batch: SceneBatch, names: list[str]) -> None:

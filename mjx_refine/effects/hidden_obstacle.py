@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mjx_refine import rotations
-from mjx_refine.batch import SceneBatch
+from mjx_refine.batch import SceneBatch, uniform_inertia
 from mjx_refine.effects.closing import GAIN, GLANCE, glance, swing
 from mjx_refine.effects.kind import (
     EffectKind,
@@ -51,14 +51,15 @@ class HiddenObstacle(EffectKind):
 
     def loads(self, motion: Motion, target: int, values: np.ndarray) -> Loads | None:
         normal, arm, depth = _met(motion, target, values)
-        if not (depth > 0).any():
-            return None
         velocity = motion.velocity[:, target] + rotations.cross(motion.spin[:, target], arm)
         approach = -(velocity * normal).sum(-1)
-        damping = damping_of(values[:, 2], motion.step)
         # A body that starts behind the wall is not thrown out of it.
-        pressed = np.minimum(depth, 0.1) * stiffness_of(motion.step) + damping * approach
-        size = motion.batch.mass[:, target] * np.where((depth > 0) & (depth < 0.3), np.maximum(pressed, 0.0), 0.0)
+        met = (depth + 0.5 * np.maximum(approach, 0.0) * motion.step > 0) & (depth < 0.3)
+        if not met.any():
+            return None
+        damping = damping_of(values[:, 2], motion.step)
+        pressed = pressed_by(np.minimum(depth, 0.1), approach, damping, motion.step)
+        size = np.where(met, pressed, 0.0) / _mobility(motion, target, arm, normal)
         slip = velocity + approach[:, None] * normal
         grip = (
             motion.batch.friction[:, target, :1] * slip / np.maximum(np.linalg.norm(slip, axis=-1, keepdims=True), 0.05)
@@ -181,25 +182,66 @@ def stiffness_of(step: float) -> float:
 
 
 def damping_of(restitution: Float[np.ndarray, "*batch"] | float, step: float) -> Float[np.ndarray, "*batch"]:
-    """Damping of the wall's contact [1/s] that returns the part ``restitution`` of a speed, in steps of ``step`` [s].
-
-    To 0.1: where within a step the wall is reached makes so much difference at 30 frames a second.
-    """
+    """Damping of the wall's contact [1/s] that returns the part ``restitution`` of a speed, in steps of ``step`` [s]."""
     damping, returned = _returned(step)
     return np.interp(-np.asarray(restitution), -returned, damping)
 
 
 @functools.cache
 def _returned(step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Dampings [1/s] and the part of a speed that each returns, in the mean over moments of contact within a step."""
-    damping = np.linspace(0.0, 0.9 / step, 64)
-    depth = np.repeat(((np.arange(16) + 0.5) / 16 * step)[None], len(damping), 0)
-    speed = np.ones_like(depth)
-    for _ in range(400):
-        pressed = stiffness_of(step) * depth + damping[:, None] * speed
-        speed = speed - step * np.where(depth > 0, np.maximum(pressed, 0.0), 0.0)
-        depth = depth + step * speed
-    return damping, np.minimum.accumulate(-speed.mean(1))
+    """Dampings [1/s] and the part of a speed that each returns."""
+    damping = 2 * np.sqrt(stiffness_of(step)) * np.concatenate([np.linspace(0.0, 1.0, 64), np.geomspace(1.02, 6.0, 32)])
+    returned = -_speed_after(np.zeros_like(damping), np.ones_like(damping), damping, np.inf, step)
+    return damping, np.minimum.accumulate(returned)
+
+
+def pressed_by(
+    depth: Float[np.ndarray, "batch"],
+    approach: Float[np.ndarray, "batch"],
+    damping: Float[np.ndarray, "batch"],
+    step: float,
+) -> Float[np.ndarray, "batch"]:
+    """Acceleration that the wall gives to the point that touches it, in the mean over a step [m/s^2].
+
+    A damped spring that pushes and never pulls, followed through the step as if nothing else acted: from the moment when the wall
+    is reached, which may be within the step, to the one when it would pull. So what it does is smooth in where it stands.
+
+    Args:
+      depth: of the point in the wall at the step's start, less than nothing before it [m].
+      approach: speed into the wall [m/s].
+      damping: of the contact [1/s].
+      step: length [s].
+    """
+    # MuJoCo's Euler steps move bodies by the velocity of a step's end: what is told at its start is that of half a step before.
+    depth = depth - 0.5 * approach * step
+    late = np.where(depth < 0, -depth / np.maximum(approach, 1e-9), 0.0)
+    after = _speed_after(np.maximum(depth, 0.0), approach, damping, np.maximum(step - late, 0.0), step)
+    return (approach - after) / step
+
+
+def _speed_after(depth: np.ndarray, speed: np.ndarray, damping: np.ndarray, time, step: float) -> np.ndarray:
+    """Speed into the wall after some time in it, or where it stops to push, if that is sooner [m/s]."""
+    stiffness, decay = stiffness_of(step), 0.5 * damping
+    beat = np.sqrt(np.maximum(np.abs(stiffness - decay**2), 1e-6 * stiffness))
+    swings = decay**2 < stiffness
+    force, pull = stiffness * depth + damping * speed, (stiffness * depth + decay * speed) / beat
+    # The force is A cos + B sin where the spring swings, and A cosh + B sinh where it is damped too much for that.
+    changing = stiffness * (speed + decay * depth) / beat - damping * pull
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crept = np.where(changing < -force, np.arctanh(np.clip(-force / changing, 0.0, 1.0 - 1e-12)), np.inf)
+    ends = np.where(swings, np.arctan2(changing, np.maximum(force, 0.0)) + 0.5 * np.pi, crept) / beat
+    told = np.minimum(time, np.where(force > 0, ends, np.where((force == 0) & (speed > 0), np.pi / beat, 0.0)))
+    angle = np.minimum(beat * told, 50.0)
+    even, odd = np.where(swings, np.cos(angle), np.cosh(angle)), np.where(swings, np.sin(angle), np.sinh(angle))
+    return np.exp(-decay * told) * (speed * even - pull * odd)
+
+
+def _mobility(motion: Motion, target: int, arm: np.ndarray, normal: np.ndarray) -> Float[np.ndarray, "batch"]:
+    """Acceleration along the normal of the point that touches for every newton along it [1/kg]."""
+    if "inertia" not in motion.lasting:
+        motion.lasting["inertia"] = uniform_inertia(motion.batch)
+    turn = np.einsum("bij,bi->bj", motion.axes[:, target], rotations.cross(arm, normal))
+    return 1.0 / motion.batch.mass[:, target] + (turn**2 / motion.lasting["inertia"][:, target]).sum(-1)
 
 
 def _alone(batch: SceneBatch, target: int) -> SceneBatch:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mjx_refine.batch import SceneBatch
+from mjx_refine.batch import SceneBatch, uniform_inertia
 from mjx_refine.scene import Shape
 
 SUBSTEPS = 8
@@ -121,22 +121,6 @@ def model_fields(batch: SceneBatch) -> ModelFields:
         pair_solreffriction=np.stack([-stiffness, -grip], -1),
         gravity=batch.gravity,
     )
-
-
-def uniform_inertia(batch: SceneBatch) -> Float[np.ndarray, "batch objects 3"]:
-    """Principal moments of inertia of bodies of uniform density [kg m^2]."""
-    columns = []
-    for i, shape in enumerate(batch.shapes):
-        x, y, z = np.moveaxis(batch.size[:, i], -1, 0)
-        if shape == "sphere":
-            unit = np.stack([0.4 * x**2] * 3, -1)
-        elif shape == "cylinder":
-            across = x**2 / 4 + (2 * y) ** 2 / 12
-            unit = np.stack([across, across, x**2 / 2], -1)
-        else:
-            unit = np.stack([y**2 + z**2, x**2 + z**2, x**2 + y**2], -1) / 3
-        columns.append(unit * batch.mass[:, i, None])
-    return np.stack(columns, 1)
 
 
 ABOVE_FLOOR = ("geom_size", "geom_rbound", "geom_aabb", "body_mass", "body_inertia", "body_invweight0", "body_ipos")
