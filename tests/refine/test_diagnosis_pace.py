@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mjx_refine.diagnosis.fits import pace
 from mjx_refine.diagnosis.fits.pace import OWN, STEPS, Differences, Effort, descended
 from mjx_refine.diagnosis.joint.differences import JointDifferences
 
@@ -74,6 +75,14 @@ def test_the_posterior_is_not_made_narrower_by_jags():
     wrong = volume(jagged.of(z, base, STEPS[0]))
     assert volume(jagged.surest(z, base)) == pytest.approx(volume(SLOPES), abs=0.6)
     assert wrong > volume(SLOPES) + 5
+
+
+def test_jags_that_one_longer_step_does_not_show_are_told_where_they_are_doubted(monkeypatch):
+    z, differences = np.zeros(3), differences_of([0, 1, 2])
+    monkeypatch.setattr(pace, "tells_jags", lambda told, change: False)
+    base = differences.residuals(z[None])[0][0]
+    plain, doubted = differences.surest(z, base), differences.surest(z, base, doubted=True)
+    assert np.linalg.norm(plain - SLOPES) > 10 * np.linalg.norm(doubted - SLOPES)
 
 
 def test_least_squares_cross_the_jags():

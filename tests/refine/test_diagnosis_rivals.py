@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 from typing import Any
 
@@ -96,6 +97,7 @@ def test_with_new_noise_what_the_best_outdoes_is_given_up_where_it_stays_behind(
 
     monkeypatch.setattr(search, "_along_its_own", lambda clip, fit: fit)
     monkeypatch.setattr(exchange, "at_least_nothing", nothing)
+    monkeypatch.setattr(exchange, "surely", lambda clip, base, fitted: (base, fitted))
     for module in (exchange, search):
         monkeypatch.setattr(module, "in_order", lambda clip, found: tuple(found))
     base: Any = SimpleNamespace(hypothesis=SimpleNamespace(terms=()), evidence=0.0)
@@ -105,7 +107,7 @@ def test_with_new_noise_what_the_best_outdoes_is_given_up_where_it_stays_behind(
     own = [("", np.inf), ("camera_shake", np.inf), ("drag", np.inf), ("push", 7.0), ("camera_shake", np.inf)]
     assert asked == own
     assert [one.names for one in found] == [("camera_shake",), ("drag",), ("push",)]
-    assert behind == [BEST.fit, NEAR.fit, FAR.fit]
+    assert behind == [BEST.fit, NEAR.fit, FAR.fit, two.fit]
     assert all(isinstance(one, Candidate) for one in twos)
 
 
@@ -135,6 +137,7 @@ def test_beside_what_leaves_only_noise_no_second_effect_is_looked_for(monkeypatc
 def test_what_leads_is_held_against_the_base_model_without_states_after_impacts_too(monkeypatch, without, kept):
     monkeypatch.setattr(exchange, "in_order", lambda clip, found: tuple(found))
     monkeypatch.setattr(exchange, "at_least_nothing", lambda clip, base, fitted: fitted)
+    monkeypatch.setattr(exchange, "surely", lambda clip, base, fitted: (base, fitted))
     monkeypatch.setattr(search, "_refitted", lambda clip, fit, iterations, rival: fit)
     nodes, plain = (SimpleNamespace(evidence=evidence) for evidence in (-150.0, without))
     one = candidate(search.CLEAR + 10.0, ("drag", 0))
@@ -145,3 +148,23 @@ def test_what_leads_is_held_against_the_base_model_without_states_after_impacts_
     assert pairs == ()
     little = candidate(0.9 * search.CLEAR, ("drag", 0))
     assert search._against_both(clip, nodes, plain, (little,), ())[0] is nodes  # type: ignore[arg-type]
+
+
+def test_an_effect_that_needs_no_states_after_impacts_is_told_without(monkeypatch):
+    """Twelve more numbers for every state take in what acts all along, and cost evidence."""
+    monkeypatch.setattr(search, "in_order", lambda clip, found: tuple(sorted(found, key=lambda one: -one.lead)))
+    monkeypatch.setattr(search, "_refitted", lambda clip, fit, iterations, rival: fit)
+    clip: Any = SimpleNamespace(
+        crew=SimpleNamespace(each=lambda clip, piece, rows: [piece(clip, *row) for row in rows])
+    )
+    base: Any = SimpleNamespace(evidence=5.0)
+    slope, drag = candidate(20.0, ("slope", -1)), candidate(30.0, ("drag", 0))
+    found = [candidate(lead, one) for lead, one in ((70.0, ("slope", -1)), (25.0, ("drag", 0)), (60.0, ("wind", -1)))]
+    weak = dataclasses.replace(found[2], lead=search.CLEAR - 1)
+    told = search._or_without(clip, base, (drag, slope), (found[0], weak))
+    assert [(one.names[0], one.lead) for one in told] == [("slope", 65.0), ("drag", 30.0)]
+    assert told[0].fit is found[0].fit
+    assert search._or_without(clip, base, (drag, slope), ()) == (drag, slope)
+    # One that explains less without them keeps them.
+    told = search._or_without(clip, base, (drag,), (dataclasses.replace(found[1], lead=90.0),))
+    assert told[0].fit is drag.fit

@@ -2,6 +2,7 @@
 
 import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from mjx_refine.diagnosis.fits.hypothesis import term
 from mjx_refine.diagnosis.fits.numbers import tied
 from mjx_refine.diagnosis.fits.pace import ATTEMPTS, STEPS, Differences, Effort, damped, descended, updated
 from mjx_refine.diagnosis.fits.roam import Strategy
-from mjx_refine.diagnosis.search.exchange import at_least_nothing, exchanged
+from mjx_refine.diagnosis.search.exchange import at_least_nothing, exchanged, surely
 from mjx_refine.diagnosis.seen.measure import Parts, moment_roughness
 from mjx_refine.diagnosis.seen.noise import Counts, settled
 
@@ -251,6 +252,38 @@ def test_effects_that_ended_behind_the_base_model_stand_at_no_size():
     assert told[("behind", -1)][1] == 2.0
     assert told[("placed", 0)][0] is placed
     assert np.allclose(told[("longer", 0)][0].z, [0.5, 0.0, 0.0])
+
+
+def test_what_gains_is_weighed_by_larger_differences_as_the_base_model_is():
+    """With the same numbers one hypothesis may have told its jags and another not: then evidence differs by nothing else."""
+    asked: list[Any] = []
+
+    def at(hypothesis, z, doubted):
+        asked.append((hypothesis, doubted))
+        return SimpleNamespace(hypothesis=hypothesis, z=z, cost=0.0, evidence=-50.0)
+
+    clip: Any = SimpleNamespace(
+        at=at, crew=SimpleNamespace(each=lambda clip, piece, rows: [piece(clip, *r) for r in rows])
+    )
+
+    def fit(name: str, evidence: float, cost: float) -> Any:
+        return SimpleNamespace(hypothesis=name, z=np.zeros(1), evidence=evidence, cost=cost)
+
+    base = fit("base", -250.0, 80.0)
+    rows = {
+        "leads": fit("leads", -50.0, 80.0),
+        "costs less": fit("costs less", -260.0, 60.0),
+        "idle": fit("idle", -252.0, 79.0),
+    }
+    fitted = {(name, -1): (one, 7.0) for name, one in rows.items()}
+    again, told = surely(clip, base, fitted)
+    assert asked == [("base", True), ("leads", True), ("costs less", True)]
+    assert again.evidence == told["leads", -1][0].evidence
+    assert told["idle", -1][0] is rows["idle"]
+    assert [promise for _, promise in told.values()] == [7.0] * 3
+    asked.clear()
+    assert surely(clip, base, {("idle", -1): (rows["idle"], 0.0)})[0] is base
+    assert not asked
 
 
 @pytest.mark.parametrize(("likeness", "told"), [(0.99, 1), (0.5, 0)])

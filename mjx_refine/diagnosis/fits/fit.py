@@ -55,10 +55,9 @@ class ClipFit:
         self.noise = noise or everywhere(measured, frames)
         self.predictor = Predictor.of(measured, simulator.shapes, image, simulator.fps)
         self.rollouts, self.counts, self.slackness = 0.0, Counts(), 1.0
-        self.store, self.crew = Store(), Crew()
+        self.store, self.crew, self._slacks = Store(), Crew(), Slacks()
         self._loose: Loose | None = None
         self._columns: np.ndarray | None = None
-        self._slacks = Slacks()
 
     # --- in other processes -----------------------------------------------------------------------------------------
     def again(self) -> Callable[[int], ClipFit]:
@@ -390,10 +389,11 @@ class ClipFit:
         price = hypothesis.price + (slack.price if (slack := self._slack(keep, hypothesis)) else 0.0)
         return Fit(hypothesis, z, cost, data, jacobian, base, -cost - 0.5 * logdet - price, ended)
 
-    def at(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE) -> Fit:
-        """No step, just what holds at ``z``."""
+    def at(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE, doubted: bool = False) -> Fit:
+        """No step, just what holds at ``z``; ``doubted``: with larger differences, too (``Differences.surest``)."""
         (base,), _ = self.residuals(hypothesis, z[None], keep, scale)
-        return self._finished(hypothesis, z, base, self._differences(hypothesis, keep, scale).surest(z, base), keep)
+        told = self._differences(hypothesis, keep, scale)
+        return self._finished(hypothesis, z, base, told.surest(z, base, doubted), keep)
 
 
 def _made(shapes: tuple[Shape, ...], fps: float, measured: Measured, image, frames: int, threads: int) -> ClipFit:

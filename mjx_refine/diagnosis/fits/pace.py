@@ -102,11 +102,15 @@ class Differences:
         return self._sizes is not None and bool(np.all(self._sizes == STEPS[0]))
 
     def surest(
-        self, z: Float[np.ndarray, "dimension"], base: Float[np.ndarray, "residuals"]
+        self, z: Float[np.ndarray, "dimension"], base: Float[np.ndarray, "residuals"], doubted: bool = False
     ) -> Float[np.ndarray, "residuals dimension"]:
-        """By the smallest differences; for the numbers of which these tell a jag by the next larger ones, and so on."""
+        """By the smallest differences; for the numbers of which these tell a jag by the next larger ones, and so on.
+
+        Whether any does is told by one longer step in all of them at once, which may meet the same jags; ``doubted``: larger
+        differences are made anyway.
+        """
         told, sizes = self._fine(z), np.full(len(z), STEPS[0])
-        if self._tells_jags(z, base, told):
+        if doubted or self._tells_jags(z, base, told):
             for shorter, size in itertools.pairwise(STEPS):
                 told, sizes = without_jags(told, sizes, shorter, self._jacobian(z, size), size)
         self._sizes = sizes

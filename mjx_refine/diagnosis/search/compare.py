@@ -55,6 +55,10 @@ SMOOTH = 1.3
 and collisions of seeds 28 to 32 whose answer left something smoother six were tried: three, which had been ``unknown``, are right
 since, and three are as they were."""
 
+WITHOUT = 2
+"""How many of the effects that were found without states after impacts are held against those with: such a state is twelve more
+numbers, which an effect that acts all along may not need."""
+
 THIN = 1.0
 """How much too thin masks are from which on those of objects that hide one another do not touch [px]."""
 
@@ -182,7 +186,21 @@ def _shot(
     pairs = pairs_of(clip, base, singles, (), names, shown, seed, told)
     singles = _as_found_together(clip, base, singles, pairs)
     base, singles, pairs = _begun_elsewhere(clip, base, singles, pairs, seed, told)
+    singles = _or_without(clip, base, singles, before)
     return Compared(*_against_both(clip, base, plain, singles, pairs), impacts)
+
+
+def _or_without(
+    clip: ClipFit, base: Fit, singles: tuple[Candidate, ...], before: tuple[Candidate, ...]
+) -> tuple[Candidate, ...]:
+    """The single effects; those that explain more without states after impacts, as ``before``, without."""
+    first = [one for one in before if one.lead > CLEAR][:WITHOUT]
+    found = {(one.names, one.targets): one for one in singles}
+    for one, fit in zip(first, clip.crew.each(clip, _refitted, [(o.fit, 10, np.inf) for o in first]), strict=True):
+        other = found.get((one.names, one.targets))
+        if other is None or fit.evidence > other.fit.evidence:
+            found[one.names, one.targets] = Candidate(fit, lead_of(fit, base), one.promise)
+    return in_order(clip, list(found.values())) if first else singles
 
 
 def _taken_in(
@@ -229,7 +247,7 @@ def _against_both(
     plain = _refitted(clip, plain, 10, np.inf)
     if plain.evidence <= base.evidence:
         return base, singles, pairs
-    return plain, held_against(clip, plain, singles), held_against(clip, plain, pairs)
+    return held_against(clip, plain, singles, pairs)
 
 
 def _explained(clip: ClipFit, compared: Compared) -> bool:
@@ -299,9 +317,9 @@ def _again(
     rows = [(one.fit, 8, np.inf if k < near else bound) for k, one in enumerate(kept)]
     rows += [(two.fit, 8, np.inf) for two in twos]
     base, *fits = clip.crew.each(clip, _refitted, [(base, 10, np.inf), *rows])
-    found = held_against(clip, base, [dataclasses.replace(one, fit=fit) for one, fit in zip(kept, fits, strict=False)])
-    again = [Candidate(fit, lead_of(fit, base), two.promise) for two, fit in zip(twos, fits[len(kept) :], strict=True)]
-    return base, found, in_order(clip, again), impacts
+    ones = [dataclasses.replace(one, fit=fit) for one, fit in zip(kept, fits, strict=False)]
+    twos = tuple(dataclasses.replace(two, fit=fit) for two, fit in zip(twos, fits[len(kept) :], strict=True))
+    return *held_against(clip, base, ones, twos), impacts
 
 
 def thinness(singles: tuple[Candidate, ...]) -> float:

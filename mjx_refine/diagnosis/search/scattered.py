@@ -92,10 +92,10 @@ def fairly(
     base = begun_again(clip, base, fits, count)
     better = {id(one): fit for one, fit in zip(first, fits, strict=True)}
 
-    def moved(kept: tuple[Candidate, ...]) -> tuple[Candidate, ...]:
-        return held_against(clip, base, [dataclasses.replace(one, fit=better.get(id(one), one.fit)) for one in kept])
+    def moved(kept: tuple[Candidate, ...]) -> list[Candidate]:
+        return [dataclasses.replace(one, fit=better.get(id(one), one.fit)) for one in kept]
 
-    return base, moved(singles), moved(pairs)
+    return held_against(clip, base, moved(singles), moved(pairs))
 
 
 def _others(fit: Fit, sources: Sequence[Fit], count: int) -> list[tuple[np.ndarray, tuple[float, ...]]]:

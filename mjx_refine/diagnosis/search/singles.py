@@ -10,7 +10,7 @@ from mjx_refine.diagnosis.fits.candidates import Candidate, in_order, lead_of, l
 from mjx_refine.diagnosis.fits.fit import SCALE, ClipFit, Fit
 from mjx_refine.diagnosis.fits.knock import knocked, to_the_end
 from mjx_refine.diagnosis.fits.roam import ROAMED_AGAIN
-from mjx_refine.diagnosis.search.exchange import Fitted, Key, at_least_nothing, exchanged
+from mjx_refine.diagnosis.search.exchange import Fitted, Key, at_least_nothing, exchanged, surely
 from mjx_refine.diagnosis.search.given import far_from_given, leaves_much
 from mjx_refine.diagnosis.search.leads import FORGIVING, begun, chosen_of
 from mjx_refine.diagnosis.search.lost import NAME as LOST
@@ -125,7 +125,7 @@ def singles_of(
         # Without jags there is nothing to look around for.
         if not shots:
             base, fitted = _from_other_places(clip, base, fitted, seed, told, video)
-    fitted = at_least_nothing(clip, base, fitted)
+    base, fitted = surely(clip, base, at_least_nothing(clip, base, fitted))
     finals = [Candidate(fit, lead_of(fit, base), promise) for fit, promise in fitted.values()]
     return base, in_order(clip, finals), unbent
 
