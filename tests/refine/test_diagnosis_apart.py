@@ -125,6 +125,32 @@ def test_stretches_that_nodes_keep_apart_share_rollouts(distance, effect):
         assert change[k] == pytest.approx(missed_of(hypothesis, alone, fly)[0] - begun, abs=1e-6)
 
 
+def test_stretches_are_told_apart_beside_a_larger_company():
+    """Two objects that meet have more numbers than a third with a node: as many rollouts as rows, in another order."""
+    pair = scene(0.35)
+    third = Body("sphere", "third", (0.15,), (2.0, 0.1, 0.5), linear_velocity=(-0.2, 0.0, 0.0))
+    one = dataclasses.replace(pair, objects=(*pair.objects, third))
+    state = np.array([2.3, 0, 0.9, 1, 0, 0, 0, 0.2, 0.1, 1.0, 1.0, 2.0, 0.5])
+    hypothesis = dataclasses.replace(Hypothesis(Space.around(one)), nodes=(Node(2, 6, state, np.full(12, 0.1), ()),))
+    simulator = MujocoSimulator(one.shapes, 30.0, 1)
+    sizes = [int((np.isin(hypothesis.owners, company)).sum()) for company in ([0, 1], [2])]
+    assert sizes[0] >= sizes[1]
+
+    def fly(batch):
+        return simulator.shot(batch, FRAMES)
+
+    z, step = np.zeros(hypothesis.dimension), np.full(hypothesis.dimension, 0.01)
+    told = beside(hypothesis, z, step, fly)
+    change = told.change_of_missed(missing(hypothesis.nodes))
+    still, begun = fly(hypothesis.batch(z[None]))[0][0], missed_of(hypothesis, z, fly)[0]
+    for k in range(hypothesis.dimension):
+        alone = z.copy()
+        alone[k] += step[k]
+        found = np.where(told.felt[k, :3, None], told.poses[told.row[k]], still)
+        assert found == pytest.approx(fly(hypothesis.batch(alone[None]))[0][0], abs=1e-8)
+        assert change[k] == pytest.approx(missed_of(hypothesis, alone, fly)[0] - begun, abs=1e-6)
+
+
 def test_effects_that_couple_objects_keep_rollouts_apart(monkeypatch):
     one = scene(1.5)
     hypothesis = Hypothesis(Space.around(one)).added(term("magnus", 0, 12))

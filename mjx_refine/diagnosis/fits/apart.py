@@ -71,7 +71,7 @@ def beside(
         rows, shared = _shared(hypothesis, np.zeros_like(company))
         batch, flown = _flown(hypothesis, z, shared * step, still, fly)
         company = np.zeros_like(company)
-    if len(shared) < len(rows):
+    if shared is not rows:
         batch = _stepped(hypothesis, z, rows * step)
         flown = _told_apart(hypothesis, company, rows, shared, still, flown)
     row = rows.argmax(0)

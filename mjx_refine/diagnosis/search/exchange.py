@@ -29,8 +29,8 @@ NEAR = 1.3
 
 SURE, DOUBTED = 4, 15.0
 """How many hypotheses are weighed by derivatives that larger differences tell, too, and what they must gain on the base model, in
-evidence or in cost. (Of three objects that collide, where nothing was missing, effects of no size led by 212: with the same
-numbers, residuals and cost, one hypothesis' jags had been seen and the base model's not.)"""
+evidence or in cost. (Of three objects that collide the same numbers, with an effect of no size, had 8 less by the smallest
+differences, whose jags were not seen there, than by larger ones.)"""
 
 ALONE = 10
 """Of one of two effects, from what both found together."""
