@@ -3,8 +3,10 @@
 import os
 import subprocess
 import sys
+import time
 
 import pytest
+from hypothesis import strategies as st
 
 from benchmarks.bad_cases import good_files, scene_text
 from benchmarks.bad_input import CASES, Outcome, attempt, fuzz, listing, try_case
@@ -63,6 +65,12 @@ def test_random_texts_raise_nothing_else():
     tried, scenes = fuzz(6.0)
     assert tried > 50
     assert 0 < scenes < tried
+
+
+def test_the_fuzz_counts_its_seconds_from_the_first_text(monkeypatch):
+    naps = iter([0.3])
+    monkeypatch.setattr("benchmarks.bad_input.TEXTS", st.builds(lambda: (time.sleep(next(naps, 0.0)), scene_text())[1]))
+    assert fuzz(0.2)[0] > 0
 
 
 def test_the_fuzz_notices_a_scene_that_does_not_round_trip(monkeypatch):

@@ -16,6 +16,7 @@ import pytest
 from benchmarks import optimizers
 from benchmarks.optimizer_curves import iou_at, mean_curve, seconds_to, tables
 from benchmarks.optimizers import Curve, Method, Poses, measure
+from mjx_refine import load_observation, load_scenes
 from mjx_refine.batch import batch_from_scenes
 from mjx_refine.observation import Observation
 from mjx_refine.scene import Body, Camera, Samples, Scene
@@ -76,6 +77,13 @@ def test_methods_keep_their_budget_and_never_fall(clip, label):
         assert (np.diff(rising) >= 0).all()
     assert run["final"]["fitness"] >= run["start"]["fitness"] - 1e-9
     json.dumps(run, allow_nan=False)
+
+
+def test_the_best_sample_scores_as_it_does_alone():
+    samples, observation = load_scenes(EXAMPLE / "best32.yaml"), load_observation(EXAMPLE / "flows.npz")
+    problem = Problem(samples, observation, TINY)
+    start = problem.starts[0]
+    assert problem.score([start.given], start.matching).fitness[0] == start.fitness
 
 
 def test_without_its_truth_the_oracle_is_left_out(clip):
