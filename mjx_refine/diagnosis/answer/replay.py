@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
@@ -10,13 +11,14 @@ from jaxtyping import Float
 from mjx_refine.diagnosis.fits.base import without_grips
 from mjx_refine.diagnosis.fits.fit import ClipFit, Fit
 from mjx_refine.diagnosis.fits.hypothesis import Hypothesis, Term
+from mjx_refine.diagnosis.fits.staged import staged
 from mjx_refine.diagnosis.seen.noise import everywhere
 from mjx_refine.scene import Scene
 from mjx_refine.search.problem import Problem
 from mjx_refine.view.effects import needs_pictures
 
 ITERATIONS = 8
-"""Of least squares: it begins where the fit with erring contacts ended."""
+"""Of least squares on the whole clip: it begins where the fit with erring contacts ended."""
 
 COARSE = (120, 80)
 """Resolution at which scenes are compared whose every picture is drawn [px]."""
@@ -34,9 +36,10 @@ class Replay:
 def replays(clip: ClipFit, fits: list[Fit], problem: Problem, matching: tuple[int, ...]) -> list[Replay]:
     """For each fit the scene that replays the clip best, its effects as they were fitted; afterwards contacts may not err.
 
-    Least squares goes on over the base parameters alone; what it finds, where it began, and the scene that was given with
-    the effects put in, are compared by fitness, so that no scene replays the clip worse than the given one does (where
-    effects change what is seen, as small pictures show it).
+    Least squares goes on over the base parameters alone: on the whole clip, on ever more of it, since what comes after an impact
+    may be far off where nothing restarts, and from the replay of the fit before. What they find, where they began, and the
+    scene that was given with the effects put in, are compared by fitness, so that no scene replays the clip worse than the
+    given one does (where effects change what is seen, as small pictures show it).
 
     Args:
       clip: its slack is forgotten.
@@ -45,26 +48,39 @@ def replays(clip: ClipFit, fits: list[Fit], problem: Problem, matching: tuple[in
       matching: mask id of each object.
     """
     clip.forget_slack(everywhere(clip.measured, clip.frames))
-    found = clip.crew.each(clip, _rigid, [(fit,) for fit in fits])
-    return [_replay(clip, fit, z, problem, matching) for fit, z in zip(fits, found, strict=True)]
+    ways = [(fit, way) for fit in fits for way in (_whole, staged)]
+    ended = clip.crew.each(clip, _rigid, ways)
+    told: list[Replay] = []
+    before: np.ndarray | None = None
+    for fit in fits:
+        held, here = _held(fit)
+        points = [z for z, (one, _) in zip(ended, ways, strict=True) if one is fit]
+        if before is not None:
+            points.append(_whole(clip, held, before).z)
+        replay, before = _best(held, [*points, here, np.zeros(held.dimension)], problem, matching)
+        told.append(replay)
+    return told
 
 
-def _rigid(clip: ClipFit, fit: Fit) -> np.ndarray:
-    held, z = _held(fit)
-    return clip.fit(held, z, ITERATIONS, passing=True).z
+def _whole(clip: ClipFit, hypothesis: Hypothesis, z: np.ndarray) -> Fit:
+    return clip.fit(hypothesis, z, ITERATIONS, passing=True)
 
 
-def _replay(clip: ClipFit, fit: Fit, rigid: np.ndarray, problem: Problem, matching: tuple[int, ...]) -> Replay:
-    held, here = _held(fit)
-    given = np.zeros(held.dimension)
-    scenes = [held.scene(z, clip.frames) for z in (rigid, here, given)]
+def _rigid(clip: ClipFit, fit: Fit, way: Callable[[ClipFit, Hypothesis, np.ndarray], Fit]) -> np.ndarray:
+    return way(clip, *_held(fit)).z
+
+
+def _best(
+    hypothesis: Hypothesis, points: list[np.ndarray], problem: Problem, matching: tuple[int, ...]
+) -> tuple[Replay, Float[np.ndarray, "dimension"]]:
+    """The replay of the point that scores best, and that point."""
+    scenes = [hypothesis.scene(z, problem.observation.length) for z in points]
     # To draw every picture takes seconds a scene: which is best is seen in small ones.
-    drawn = needs_pictures(held.batch(rigid[None]))
+    drawn = needs_pictures(hypothesis.batch(points[0][None]))
     scores = problem.score(scenes, matching, COARSE if drawn else None)
     best = int(np.argmax(np.nan_to_num(scores.fitness, nan=-np.inf)))
-    if drawn:
-        scores, best, scenes = problem.score([scenes[best]], matching), 0, [scenes[best]]
-    return Replay(scenes[best], float(scores.iou[best]), float(scores.epe[best]))
+    told = problem.score([scenes[best]], matching).candidate(0) if drawn else scores.candidate(best)
+    return Replay(scenes[best], float(told.iou[0]), float(told.epe[0])), points[best]
 
 
 def _fixed(t: Term, values: np.ndarray) -> Term:
