@@ -120,10 +120,20 @@ def test_a_verdict_says_what_pushes_and_what_is_left():
     assert "2.0 times what noise does" in far
 
 
-def test_a_force_that_turns_round_twice_is_unknown():
+FEW = ("wind", "push")
+
+
+@pytest.mark.parametrize(
+    "without",
+    [
+        pytest.param((), marks=pytest.mark.slow, id="whole"),
+        pytest.param(tuple(sorted(set(catalogue()) - set(FEW))), id="few"),
+    ],
+)
+def test_a_force_that_turns_round_twice_is_unknown(without):
     given = dataclasses.replace(FLIGHT, objects=(dataclasses.replace(THROWN, linear_velocity=(2.7, 0.3, 2.05)),))
     course = np.outer(np.array([1, 1, -1, -1, -1, 1, 1]) * 12.0 * THROWN.mass, [0.8, 0.0, 0.6])
-    strange = diagnose(given, strange_clip(FLIGHT, course), threads=1)
+    strange = diagnose(given, strange_clip(FLIGHT, course), without=without, threads=1)
     assert strange.verdict.effects == ("unknown",)
     assert strange.signs["unnamed"] > UNNAMED
     assert any("N at" in note for note in strange.notes)
