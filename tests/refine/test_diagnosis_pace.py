@@ -33,7 +33,7 @@ def differences_of(jagged, curved=0.0):
     def jacobian(z, size):
         step = np.broadcast_to(size, z.shape)
         moved, _ = residuals(z + np.diag(step))
-        return ((moved - residuals(z[None])[0]) / step[:, None]).T
+        return ((moved - residuals(z[None])[0]) / np.where(step, step, 1.0)[:, None]).T
 
     return Differences(residuals, jacobian, BOUNDS)
 
@@ -61,6 +61,27 @@ def test_a_number_with_jags_is_told_by_longer_differences_and_the_others_are_not
     assert np.linalg.norm(fine[:, 1]) > 10 * np.linalg.norm(SLOPES[:, 1])
     assert np.linalg.norm(told[:, 1] - SLOPES[:, 1]) < 0.5 * np.linalg.norm(SLOPES[:, 1])
     assert differences.tried(False) == (OWN, STEPS[0])
+
+
+def asked_of(differences):
+    """The sizes that are asked for from now on."""
+    inner, sizes = differences._jacobian, []
+    differences._jacobian = lambda z, size: sizes.append(np.broadcast_to(size, z.shape).tolist()) or inner(z, size)
+    return sizes
+
+
+def test_the_longest_differences_are_made_of_the_numbers_with_jags_alone():
+    differences, z = differences_of([1]), np.zeros(3)
+    asked = asked_of(differences)
+    differences.surest(z, differences.residuals(z[None])[0][0])
+    assert asked == [[STEPS[0]] * 3, [STEPS[1]] * 3, [0.0, STEPS[2], 0.0]]
+
+
+def test_where_no_longer_difference_tells_a_jag_none_still_longer_is_made():
+    differences, z = differences_of([]), np.zeros(3)
+    asked = asked_of(differences)
+    differences.surest(z, differences.residuals(z[None])[0][0], doubted=True)
+    assert asked == [[STEPS[0]] * 3, [STEPS[1]] * 3]
 
 
 def test_the_posterior_is_not_made_narrower_by_jags():

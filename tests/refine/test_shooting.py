@@ -174,6 +174,22 @@ def test_derivatives_by_states_are_those_of_residuals(bounced):
     assert np.abs(jacobian[known:, place]).max() > 0.0
 
 
+def test_derivatives_that_are_not_asked_for_cost_no_rollouts(bounced):
+    clip, base = bounced
+    hypothesis, z = base.hypothesis, base.z
+    asked = np.arange(len(z)) % 3 == 0
+    counted, told = [clip.rollouts], []
+    for size in (0.02, np.where(asked, 0.02, 0.0)):
+        told.append(clip.jacobian(hypothesis, z, size=size))
+        counted.append(clip.rollouts)
+    whole, part = told
+    assert np.array_equal(part[:, asked], whole[:, asked])
+    assert whole[:, ~asked].any()
+    assert not part[:, ~asked].any()
+    many, few = np.diff(counted)
+    assert few < 0.5 * many
+
+
 def test_an_effect_that_was_found_without_nodes_is_fitted_with_them(bounced):
     clip, base = bounced
     there = clip.fit(with_nodes(clip, base).hypothesis, with_nodes(clip, base).z, 8)

@@ -312,15 +312,15 @@ class ClipFit:
         return white, np.where(prediction.bad, np.inf, cost)
 
     def jacobian(self, hypothesis: Hypothesis, z: np.ndarray, keep=None, scale: float = SCALE, size=STEPS[0]):
-        """d residuals / d z (R, D) by differences towards the inside of the bounds."""
+        """d residuals / d z (R, D) by differences towards the inside of the bounds; of those of no size nothing is simulated."""
         step = np.where(z + size > hypothesis.bounds[1], -size, size)
         told = beside(hypothesis, z, step, lambda batch: self.flown(batch, keep))
-        prediction = self.predictor(told.poses, told.batch)
-        white = self.rigid(self.distances(prediction), keep, scale)
+        white = self.rigid(self.distances(prediction := self.predictor(told.poses, told.batch)), keep, scale)
         change = np.where(told.felt[:, self.measured.objects], white[told.row] - white[0], 0.0)
-        slack = self._slack(keep, hypothesis)
-        change = np.where(prediction.bad[told.row, None], 0.0, change if slack is None else slack(change))
-        return (np.concatenate([change, told.change_of_missed(missing(hypothesis.nodes))], 1) / step[:, None]).T
+        slack = self._slack(keep, hypothesis) or (lambda rows: rows)
+        change = np.where(prediction.bad[told.row, None], 0.0, slack(change))
+        change = np.concatenate([change, told.change_of_missed(missing(hypothesis.nodes))], 1)
+        return (change / np.where(step, step, 1.0)[:, None]).T
 
     # --- least squares --------------------------------------------------------------------------------------------
     @remembered

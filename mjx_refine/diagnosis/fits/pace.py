@@ -70,7 +70,7 @@ class Differences:
 
     Args:
       residuals: of points, one a row, and their costs.
-      jacobian: at a point, by differences of a size (or one for each number).
+      jacobian: at a point, by differences of a size (or one for each number, 0 where nothing is asked: nothing is told there).
       bounds: of the numbers.
     """
 
@@ -112,7 +112,10 @@ class Differences:
         told, sizes = self._fine(z), np.full(len(z), STEPS[0])
         if doubted or self._tells_jags(z, base, told):
             for shorter, size in itertools.pairwise(STEPS):
-                told, sizes = without_jags(told, sizes, shorter, self._jacobian(z, size), size)
+                if not (asked := sizes == shorter).any():
+                    break
+                longer = self._jacobian(z, size if asked.all() else np.where(asked, size, 0.0))
+                told, sizes = without_jags(told, sizes, shorter, longer, size)
         self._sizes = sizes
         return told
 
